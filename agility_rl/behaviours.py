@@ -1,0 +1,101 @@
+"""The five behaviours of the dog and the commands each of them accepts.
+
+Source: Fu et al. 2025, Table S2 (ranges) and section S2 (redraw period); dead-bands from the released code
+(method notes, section 4.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+BEHAVIOURS: tuple[str, ...] = ("walk", "pace", "trot", "canter", "jump")
+"""Behaviour names; the position in this tuple is the skill index everywhere in the package."""
+
+NUM_BEHAVIOURS = len(BEHAVIOURS)
+JUMP = BEHAVIOURS.index("jump")
+
+COMMANDS: tuple[str, ...] = ("velocity_x", "velocity_y", "yaw_rate", "jump_height", "locomotion_height")
+"""Entries of a command vector: m/s, m/s, rad/s, m, m."""
+
+RESAMPLE_PERIOD = 6.0
+"""Seconds between two draws of latent variables and commands (section S2)."""
+
+DEAD_BAND = (0.1, 0.05, 0.05, 0.0, 0.0)
+"""Smaller commands become zero: m/s, m/s, rad/s (released code)."""
+
+
+@dataclass(frozen=True)
+class CommandRange:
+    """Closed interval of every command of one behaviour; ``None`` means that the command is unused and zero."""
+
+    velocity_x: tuple[float, float]
+    velocity_y: tuple[float, float]
+    yaw_rate: tuple[float, float]
+    jump_height: tuple[float, float] | None
+    locomotion_height: tuple[float, float] | None
+
+
+COMMAND_RANGES: dict[str, CommandRange] = {
+    "walk": CommandRange((0.0, 0.6), (-0.15, 0.15), (-1.0, 1.0), None, (0.25, 0.34)),
+    "pace": CommandRange((0.5, 1.5), (-0.3, 0.3), (-1.57, 1.57), None, (0.25, 0.34)),
+    "trot": CommandRange((0.5, 1.5), (-0.3, 0.3), (-1.57, 1.57), None, (0.25, 0.34)),
+    "canter": CommandRange((0.8, 2.0), (-0.5, 0.5), (-0.5, 0.5), None, (0.25, 0.34)),
+    "jump": CommandRange((0.8, 1.8), (-0.3, 0.3), (-0.5, 0.5), (0.45, 0.55), None),
+}
+"""Command ranges of the quadrupedal agility challenge (Table S2)."""
+
+
+def skill_index(name: str) -> int:
+    """Index of a behaviour.
+
+    Raises:
+        ValueError: if ``name`` is none of the five behaviours.
+
+    Example:
+        >>> skill_index("trot")
+        2
+    """
+    try:
+        return BEHAVIOURS.index(name)
+    except ValueError:
+        raise ValueError(f"{name!r} is no behaviour; expected one of {', '.join(BEHAVIOURS)}") from None
+
+
+def command_bounds() -> tuple[Tensor, Tensor]:
+    """Lower and upper bound of every command, each ``[5 behaviours, 5 commands]``; unused commands are 0.
+
+    Example:
+        >>> low, high = command_bounds()
+        >>> round(high[skill_index("canter"), 0].item(), 3)
+        2.0
+    """
+    rows = [
+        [getattr(COMMAND_RANGES[behaviour], command) or (0.0, 0.0) for command in COMMANDS] for behaviour in BEHAVIOURS
+    ]
+    bounds = torch.tensor(rows)
+    return bounds[..., 0].contiguous(), bounds[..., 1].contiguous()
+
+
+def sample_commands(skill: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """Draw a command vector uniformly from the range of each given skill, then apply the dead-bands.
+
+    Source: Table S2; dead-bands: released code.
+
+    Args:
+        skill: int64 ``[*B]``, index into :data:`BEHAVIOURS`.
+        generator: source of randomness.
+
+    Returns:
+        float32 ``[*B, 5]`` in the order and units of :data:`COMMANDS`.
+
+    Example:
+        >>> sample_commands(torch.tensor([4]))[0, 3] >= 0.45
+        tensor(True)
+    """
+    low, high = command_bounds()
+    uniform = torch.rand((*skill.shape, len(COMMANDS)), generator=generator)
+    command = low[skill] + (high - low)[skill] * uniform
+    return command.masked_fill(command.abs() < torch.tensor(DEAD_BAND), 0.0)

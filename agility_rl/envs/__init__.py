@@ -1,0 +1,12 @@
+"""Batched environments: TorchRL ``EnvBase`` over a :class:`agility_rl.simulation.Simulator`, and their terms."""
+
+from __future__ import annotations
+
+import importlib.util
+
+from agility_rl.envs.locomotion import LocomotionEnv
+
+if importlib.util.find_spec("gymnasium") is not None:  # optional; the import registers the robots with Gymnasium
+    importlib.import_module("agility_rl.envs.gymnasium")
+
+__all__ = ["LocomotionEnv"]

@@ -1,0 +1,89 @@
+"""The latent variables and task commands that a robot is asked to follow, redrawn every six seconds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from agility_rl import behaviours
+
+
+class CommandSampler:
+    """Skill c, shift epsilon and task command of ``N`` robots, with their redraw clocks.
+
+    The skill is drawn from given probabilities (the learned prior), the shift uniformly from [-1, 1], the command from
+    the range of the skill.
+
+    Source: supplement S2 (redraw every six seconds), Algorithm S1 line 3, Table S2.
+
+    Args:
+        num_robots: N.
+        generator: source of randomness.
+        period: control steps between two redraws; ``None`` never redraws by itself.
+
+    Attributes:
+        skill: int64 ``[N]``.
+        shift: ``[N, 1]``.
+        command: ``[N, 5]`` in the order of :data:`agility_rl.behaviours.COMMANDS`.
+        probabilities: ``[5]``, assign to change the skill distribution.
+
+    Example:
+        >>> sampler = CommandSampler(3, torch.Generator(), period=300)
+        >>> sampler.resample(torch.ones(3, dtype=torch.bool))
+        >>> sampler.vector().shape
+        torch.Size([3, 11])
+    """
+
+    def __init__(self, num_robots: int, generator: torch.Generator, period: int | None) -> None:
+        self.generator = generator
+        self.period = period
+        self.skill = torch.zeros(num_robots, dtype=torch.int64)
+        self.shift = torch.zeros(num_robots, 1)
+        self.command = torch.zeros(num_robots, len(behaviours.COMMANDS))
+        self.age = torch.zeros(num_robots, dtype=torch.int64)
+        self.probabilities = torch.full((behaviours.NUM_BEHAVIOURS,), 1.0 / behaviours.NUM_BEHAVIOURS)
+
+    @property
+    def jumping(self) -> Tensor:
+        """Bool ``[N]``: the commanded skill is jump."""
+        return self.skill == behaviours.JUMP
+
+    def resample(self, mask: Tensor) -> None:
+        """Redraw the rows of a bool mask ``[N]`` and restart their clocks."""
+        rows = mask.nonzero()[:, 0]
+        if not len(rows):
+            return
+        skill = torch.multinomial(self.probabilities, len(rows), replacement=True, generator=self.generator)
+        command = behaviours.sample_commands(skill, self.generator)
+        shift = 2.0 * torch.rand(len(rows), 1, generator=self.generator) - 1.0
+        self.assign(mask, skill, command, shift)
+
+    def assign(self, mask: Tensor, skill: Tensor, command: Tensor, shift: Tensor) -> None:
+        """Set the rows of a bool mask ``[N]`` to given values, one row of each argument per set row."""
+        # New tensors, because observations of earlier steps may still refer to the old ones.
+        self.skill = self.skill.masked_scatter(mask, skill)
+        self.command = self.command.masked_scatter(mask[:, None], command)
+        self.shift = self.shift.masked_scatter(mask[:, None], shift)
+        self.age = self.age.masked_fill(mask, 0)
+
+    def advance(self) -> None:
+        """Let one control step pass and redraw what has become too old."""
+        self.age = self.age + 1
+        if self.period is not None:
+            self.resample(self.age >= self.period)
+
+    def vector(self) -> Tensor:
+        """Command observation ``[N, 11]``: five commands, shift, one-hot skill (:data:`agility_rl.keys.COMMAND`)."""
+        one_hot = torch.nn.functional.one_hot(self.skill, behaviours.NUM_BEHAVIOURS).float()
+        return torch.cat((self.command, self.shift, one_hot), -1)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything but the generator."""
+        return {name: getattr(self, name).clone() for name in ("skill", "shift", "command", "age", "probabilities")}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        for name, value in state.items():
+            setattr(self, name, value.clone())

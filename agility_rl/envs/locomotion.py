@@ -1,0 +1,330 @@
+"""The environment of stages 1 and 2: a batch of Go2s that follow behaviours and commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from agility_rl import behaviours, keys, rotations
+from agility_rl.envs.commands import CommandSampler
+from agility_rl.envs.observations import HISTORY, HORIZON, ObservationGroups
+from agility_rl.envs.randomization import NOMINAL, Randomization, sample_parameters
+from agility_rl.envs.reference import ReferenceStates
+from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm
+from agility_rl.envs.state import LocomotionState
+from agility_rl.envs.terminations import body_contact, diverged
+from agility_rl.go2 import constants, features
+from agility_rl.simulation import Simulator, make_simulator
+
+PEAK_WINDOW = 0.9
+"""Seconds over which the highest trunk position counts for a jump."""
+CLEARANCE = 0.005
+"""Height added at a reset, so that no foot starts in the ground [m]."""
+
+_BUFFERS = (
+    "step_count",
+    "push_phase",
+    "action",
+    "torque",
+    "joint_velocity",
+    "heights",
+    "privileged",
+    "stiffness",
+    "damping",
+)
+
+
+class LocomotionEnv(EnvBase):
+    """``N`` Go2 robots that move in a commanded behaviour at a commanded velocity and height.
+
+    A step takes joint targets ``q* = q_default + scale * action``, holds them for one control step, and returns named
+    observation groups. Time limits are truncations; contact of trunk or hip, or divergence of the engine, terminates.
+    The reward is the task reward r^T: the sum of weighted terms times the control step, clipped at zero. Imitation,
+    skill and shift rewards are not the environment's business.
+
+    Source: method notes, section 4; supplement S2, S4, Table S2.
+
+    Keys written (``N`` robots): ``proprioception`` [N, 45], ``explicit`` [N, 4], ``privileged`` [N, 29], ``history``
+    [N, 10, 45], ``command`` [N, 11], ``peak`` [N, 1], ``motion`` [N, 2, 49], ``skill`` [N], ``shift`` [N, 1],
+    ``reward`` [N, 1], ``(reward_terms, name)`` [N, 1], ``done``, ``terminated``, ``truncated`` [N, 1]. Units stand in
+    :mod:`agility_rl.keys`.
+
+    Args:
+        num_robots: N.
+        simulator: ready simulator, or ``None`` for the CPU one built with ``simulator_options``.
+        simulator_options: keyword arguments of :func:`agility_rl.simulation.make_simulator`.
+        reference: states for reference-state initialisation as :class:`ReferenceStates` takes them; ``None`` starts
+            from standing.
+        rewards: reward terms by name.
+        randomization: ranges of physical parameters, drawn anew at each reset; ``None`` leaves the model nominal.
+        observation_noise: factor on the noise of :data:`agility_rl.go2.features.PROPRIOCEPTION_LAYOUT`.
+        episode_length: seconds until truncation.
+        resample_period: seconds between redraws of latents and commands; ``None`` leaves them to
+            :meth:`set_commands`.
+        push_interval: seconds between pushes; ``None`` for none.
+        push_velocity: largest horizontal speed on each axis that a push sets [m/s].
+        seed: seed of all randomness in the environment.
+
+    Raises:
+        ValueError: if the simulator holds another number of robots, a reference entry is missing, or a behaviour has
+            no reference state.
+
+    Example:
+        >>> env = LocomotionEnv(2, simulator_options={"num_threads": 1})
+        >>> rollout = env.rollout(3)
+        >>> rollout["next", "motion"].shape
+        torch.Size([2, 3, 2, 49])
+        >>> env.close()
+    """
+
+    def __init__(
+        self,
+        num_robots: int,
+        *,
+        simulator: Simulator | None = None,
+        simulator_options: Mapping[str, Any] | None = None,
+        reference: TensorDictBase | None = None,
+        rewards: Mapping[str, RewardTerm] = LOCOMOTION_REWARDS,
+        randomization: Randomization | None = None,
+        observation_noise: float = 0.0,
+        episode_length: float = 20.0,
+        resample_period: float | None = behaviours.RESAMPLE_PERIOD,
+        push_interval: float | None = None,
+        push_velocity: float = 0.5,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(device="cpu", batch_size=torch.Size([num_robots]))
+        self.simulator = simulator or make_simulator(num_simulations=num_robots, **(simulator_options or {}))
+        if self.simulator.num_simulations != num_robots:
+            raise ValueError(f"the simulator holds {self.simulator.num_simulations} robots, expected {num_robots}")
+        self.dt = self.simulator.control_dt
+        self.rewards = dict(rewards)
+        self.randomization = randomization
+        self.max_steps = round(episode_length / self.dt)
+        self.push_steps = None if push_interval is None else round(push_interval / self.dt)
+        self.push_velocity = push_velocity
+        self.generator = torch.Generator().manual_seed(seed)
+        period = None if resample_period is None else round(resample_period / self.dt)
+        self.commands = CommandSampler(num_robots, self.generator, period)
+        self.observations = ObservationGroups(num_robots, self.generator, observation_noise)
+        self.reference = ReferenceStates.standing() if reference is None else ReferenceStates(reference)
+        self._default_pose = torch.tensor(constants.DEFAULT_POSE)
+        self._action_scale = torch.tensor(constants.ACTION_SCALE)
+
+        n = num_robots
+        self._step_count = torch.zeros(n, dtype=torch.int64)
+        self._push_phase = torch.zeros(n, dtype=torch.int64)
+        self._action = torch.zeros(n, constants.NUM_JOINTS)
+        self._torque = torch.zeros(n, constants.NUM_JOINTS)
+        self._joint_velocity = torch.zeros(n, constants.NUM_JOINTS)
+        self._heights = torch.zeros(n, round(PEAK_WINDOW / self.dt))
+        fields, self._privileged = sample_parameters(n, NOMINAL, self.generator)
+        self._stiffness, self._damping = fields["stiffness"], fields["damping"]
+        self._make_specs(n)
+
+    def _make_specs(self, n: int) -> None:
+        def group(*shape: int) -> Unbounded:
+            return Unbounded((n, *shape), dtype=torch.float32)
+
+        self.observation_spec = Composite(
+            {
+                keys.PROPRIOCEPTION: group(features.NUM_PROPRIOCEPTION),
+                keys.EXPLICIT: group(features.NUM_EXPLICIT),
+                keys.PRIVILEGED: group(29),
+                keys.HISTORY: group(HISTORY, features.NUM_PROPRIOCEPTION),
+                keys.COMMAND: group(len(behaviours.COMMANDS) + 1 + behaviours.NUM_BEHAVIOURS),
+                keys.PEAK: group(1),
+                keys.MOTION: group(HORIZON, features.NUM_MOTION),
+                keys.SKILL: Categorical(behaviours.NUM_BEHAVIOURS, shape=(n,), dtype=torch.int64),
+                keys.SHIFT: Bounded(-1.0, 1.0, (n, 1), dtype=torch.float32),
+                keys.REWARD_TERMS: Composite({name: group(1) for name in self.rewards}, shape=(n,)),
+            },
+            shape=(n,),
+        )
+        self.action_spec = Unbounded((n, constants.NUM_JOINTS), dtype=torch.float32)
+        self.reward_spec = Unbounded((n, 1), dtype=torch.float32)
+        self.full_done_spec = Composite(
+            {name: Binary(shape=(n, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}, shape=(n,)
+        )
+
+    @property
+    def num_robots(self) -> int:
+        """Number of robots."""
+        return self.batch_size[0]
+
+    def set_commands(self, skill: Tensor, command: Tensor, shift: Tensor | None = None) -> None:
+        """Command every robot from the next observation on.
+
+        Args:
+            skill: int64 ``[N]``.
+            command: ``[N, 5]`` in the order and units of :data:`agility_rl.behaviours.COMMANDS`.
+            shift: ``[N, 1]`` in [-1, 1], zero if not given.
+        """
+        shift = torch.zeros(self.num_robots, 1) if shift is None else shift
+        self.commands.assign(torch.ones(self.num_robots, dtype=torch.bool), skill, command, shift)
+
+    def set_skill_probabilities(self, probabilities: Tensor) -> None:
+        """Draw future skills from ``[5]`` probabilities (the skill prior)."""
+        self.commands.probabilities = probabilities.detach().clone()
+
+    # -- TorchRL -----------------------------------------------------------------------------------------------------
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.generator.manual_seed(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = torch.ones(self.num_robots, dtype=torch.bool)
+        if tensordict is not None and (chosen := tensordict.get("_reset", None)) is not None:
+            mask = chosen.reshape(self.num_robots)
+        if self.commands.period is not None:
+            self.commands.resample(mask)
+        self._place(mask)
+        if self.randomization is not None:
+            self._randomize(mask)
+        self._step_count = self._step_count.masked_fill(mask, 0)
+        if self.push_steps is not None:
+            phase = torch.randint(self.push_steps, (self.num_robots,), generator=self.generator)
+            self._push_phase = torch.where(mask, phase, self._push_phase)
+
+        row = mask[:, None]
+        self._action = self._action.masked_fill(row, 0.0)
+        self._joint_velocity = torch.where(row, self.simulator.joint_velocity, self._joint_velocity)
+        self._heights = torch.where(row, self._height(), self._heights)
+        state = self._state(self._action)
+        self._torque = torch.where(row, state.torque, self._torque)
+        self.observations.reset(mask, state)
+
+        observation = self.observations.build(state, self.commands, self._privileged)
+        nothing = {name: torch.zeros(self.num_robots, 1) for name in self.rewards}
+        observation[keys.REWARD_TERMS] = TensorDict(nothing, self.batch_size)
+        for name in ("done", "terminated", "truncated"):
+            observation[name] = torch.zeros(self.num_robots, 1, dtype=torch.bool)
+        return observation
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict[keys.ACTION]
+        if self.push_steps is not None:
+            self._push()
+        self.simulator.step(self._default_pose + self._action_scale * action)
+        self._step_count = self._step_count + 1
+        self._heights = torch.cat((self._heights[:, 1:], self._height()), -1)
+
+        state = self._state(action)
+        terms = {
+            name: (term.weight * self.dt * term.function(state)).masked_fill(state.unstable, 0.0)[:, None]
+            for name, term in self.rewards.items()
+        }
+        reward = torch.cat(tuple(terms.values()), -1).sum(-1, keepdim=True).clamp(min=0.0)
+        terminated = (body_contact(state) | diverged(state))[:, None]
+        truncated = (self._step_count >= self.max_steps)[:, None] & ~terminated
+
+        self.commands.advance()
+        self.observations.update(state)
+        self._action, self._torque, self._joint_velocity = action.clone(), state.torque, state.joint_velocity
+        observation = self.observations.build(state, self.commands, self._privileged)
+        observation["reward"] = reward
+        observation["terminated"], observation["truncated"] = terminated, truncated
+        observation["done"] = terminated | truncated
+        observation[keys.REWARD_TERMS] = TensorDict(terms, self.batch_size)
+        return observation
+
+    # -- physics -----------------------------------------------------------------------------------------------------
+    def _height(self) -> Tensor:
+        position = self.simulator.root_position
+        return position[:, 2:] - self.simulator.ground_height(position[:, :2])[:, None]
+
+    def _place(self, mask: Tensor) -> None:
+        n = self.num_robots
+        start = self.reference.sample(self.commands.skill, self.generator)
+        yaw = 2.0 * torch.pi * torch.rand(n, generator=self.generator)
+        turn = rotations.from_euler(torch.zeros(n), torch.zeros(n), yaw)
+        place = self.simulator.ground_extent * (2.0 * torch.rand(n, 2, generator=self.generator) - 1.0)
+        height = self.simulator.ground_height(place)[:, None] + start["root_height"] + CLEARANCE
+        self.simulator.reset(
+            mask,
+            root_position=torch.cat((place, height), -1),
+            root_quaternion=rotations.multiply(turn, start["root_quaternion"]),
+            root_linear_velocity=rotations.rotate(turn, start["root_linear_velocity"]),
+            root_angular_velocity=rotations.rotate_inverse(start["root_quaternion"], start["root_angular_velocity"]),
+            joint_position=start["joint_position"],
+            joint_velocity=start["joint_velocity"],
+        )
+
+    def _randomize(self, mask: Tensor) -> None:
+        assert self.randomization is not None
+        fields, privileged = sample_parameters(self.num_robots, self.randomization, self.generator)
+        self.simulator.set_parameters(mask, **fields)
+        row = mask[:, None]
+        self._privileged = torch.where(row, privileged, self._privileged)
+        self._stiffness = torch.where(row, fields["stiffness"], self._stiffness)
+        self._damping = torch.where(row, fields["damping"], self._damping)
+
+    def _push(self) -> None:
+        mask = (self._step_count + self._push_phase) % self.push_steps == self.push_steps - 1  # type: ignore[operator]
+        if bool(mask.any()):
+            velocity = self.push_velocity * (2.0 * torch.rand(self.num_robots, 2, generator=self.generator) - 1.0)
+            self.simulator.push(mask, velocity)
+
+    def _state(self, action: Tensor) -> LocomotionState:
+        simulator = self.simulator
+        roll, pitch, yaw = rotations.to_euler(simulator.root_quaternion)
+        target = self._default_pose + self._action_scale * action
+        force = simulator.contact_force
+        legs = force[:, 1:].unflatten(-1, (4, 4))
+        return LocomotionState(
+            root_height=self._heights[:, -1:],
+            roll=roll,
+            pitch=pitch,
+            yaw=yaw,
+            linear_velocity=rotations.rotate_inverse(simulator.root_quaternion, simulator.root_linear_velocity),
+            angular_velocity=simulator.root_angular_velocity,
+            joint_position=simulator.joint_position,
+            joint_velocity=simulator.joint_velocity,
+            previous_joint_velocity=self._joint_velocity,
+            torque=self._stiffness * (target - simulator.joint_position) - self._damping * simulator.joint_velocity,
+            previous_torque=self._torque,
+            action=action,
+            previous_action=self._action,
+            trunk_contact=force[:, 0],
+            hip_contact=legs[..., 0],
+            thigh_contact=legs[..., 1],
+            calf_contact=legs[..., 2],
+            foot_contact=legs[..., 3],
+            command=self.commands.command,
+            jumping=self.commands.jumping,
+            peak_height=self._heights.amax(-1),
+            unstable=simulator.unstable,
+            dt=self.dt,
+        )
+
+    # -- resume ------------------------------------------------------------------------------------------------------
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:  # type: ignore[override]
+        """Everything that an exact continuation needs: simulator, commands, memories, clocks, generator."""
+        return {
+            "simulator": self.simulator.state_dict(),
+            "commands": self.commands.state_dict(),
+            "observations": self.observations.state_dict(),
+            "buffers": {name: getattr(self, f"_{name}").clone() for name in _BUFFERS},
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
+        """Restore what :meth:`state_dict` returned."""
+        self.simulator.load_state_dict(state_dict["simulator"])
+        self.commands.load_state_dict(state_dict["commands"])
+        self.observations.load_state_dict(state_dict["observations"])
+        for name in _BUFFERS:
+            setattr(self, f"_{name}", state_dict["buffers"][name].clone())
+        self.generator.set_state(state_dict["generator"])
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Release the simulator's threads and memory."""
+        if not self.is_closed:
+            self.simulator.close()
+        super().close(raise_if_closed=raise_if_closed)

@@ -1,0 +1,111 @@
+"""Observation groups of a locomotion environment and the short memories behind them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from agility_rl import keys
+from agility_rl.envs.commands import CommandSampler
+from agility_rl.envs.state import LocomotionState
+from agility_rl.go2 import features
+
+HISTORY = 10
+"""Frames of proprioception history (released code)."""
+HORIZON = 2
+"""Consecutive discriminator frames (Table S1)."""
+FOOT_CONTACT_FORCE = 2.0
+"""Force on a foot that counts as contact [N], now or one step earlier (released code)."""
+OBSERVATION_LIMIT = 100.0
+"""Measured numbers are clipped to +- this (released code)."""
+
+
+class ObservationGroups:
+    """Builds the named observations of ``N`` robots from their state.
+
+    The history holds what the robot measured, noise included; its newest frame is the present proprioception.
+
+    Source: method notes, section 3.2.
+
+    Args:
+        num_robots: N.
+        generator: source of the noise.
+        noise: factor on the half-widths of :data:`agility_rl.go2.features.PROPRIOCEPTION_LAYOUT`.
+    """
+
+    def __init__(self, num_robots: int, generator: torch.Generator, noise: float = 0.0) -> None:
+        self.generator = generator
+        self.noise = noise * features.noise_scale(features.PROPRIOCEPTION_LAYOUT) if noise else None
+        self.history = torch.zeros(num_robots, HISTORY, features.NUM_PROPRIOCEPTION)
+        self.motion = torch.zeros(num_robots, HORIZON, features.NUM_MOTION)
+        self.touched = torch.zeros(num_robots, 4, dtype=torch.bool)
+
+    def reset(self, mask: Tensor, state: LocomotionState) -> None:
+        """Fill the memories of the rows of a bool mask ``[N]`` with copies of the present."""
+        touched = state.foot_contact > FOOT_CONTACT_FORCE
+        row = mask[:, None]
+        self.touched = torch.where(row, touched, self.touched)
+        self.history = torch.where(row[..., None], self._measure(state, touched)[:, None], self.history)
+        self.motion = torch.where(row[..., None], _motion_frame(state)[:, None], self.motion)
+
+    def update(self, state: LocomotionState) -> None:
+        """Append the present to the memories of every robot."""
+        touched = state.foot_contact > FOOT_CONTACT_FORCE
+        measured = self._measure(state, touched | self.touched)
+        self.touched = touched
+        self.history = torch.cat((self.history[:, 1:], measured[:, None]), 1)
+        self.motion = torch.cat((self.motion[:, 1:], _motion_frame(state)[:, None]), 1)
+
+    def build(self, state: LocomotionState, commands: CommandSampler, privileged: Tensor) -> TensorDict:
+        """All observation groups, ``[N]``."""
+        return TensorDict(
+            {
+                keys.PROPRIOCEPTION: self.history[:, -1],
+                keys.EXPLICIT: features.explicit(state.root_height, state.linear_velocity),
+                keys.PRIVILEGED: privileged,
+                keys.HISTORY: self.history,
+                keys.COMMAND: commands.vector(),
+                keys.PEAK: (state.peak_height * commands.jumping)[:, None],
+                keys.MOTION: self.motion,
+                keys.SKILL: commands.skill,
+                keys.SHIFT: commands.shift,
+            },
+            [len(self.history)],
+        )
+
+    def _measure(self, state: LocomotionState, touched: Tensor) -> Tensor:
+        measured = features.proprioception(
+            torch.stack((state.roll, state.pitch), -1),
+            state.angular_velocity,
+            state.joint_position,
+            state.joint_velocity,
+            state.action,
+            touched,
+        )
+        if self.noise is not None:
+            measured = measured + self.noise * (2.0 * torch.rand(measured.shape, generator=self.generator) - 1.0)
+        return measured.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The memories."""
+        return {name: getattr(self, name).clone() for name in ("history", "motion", "touched")}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        for name, value in state.items():
+            setattr(self, name, value.clone())
+
+
+def _motion_frame(state: LocomotionState) -> Tensor:
+    return features.motion_frame(
+        state.root_height,
+        state.roll,
+        state.pitch,
+        state.linear_velocity,
+        state.angular_velocity,
+        state.joint_position,
+        state.joint_velocity,
+    )

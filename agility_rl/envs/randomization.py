@@ -1,0 +1,77 @@
+"""Draws of physical parameters, one function call per reset.
+
+Source: method notes, section 4.5 (released code): friction 0.6 to 2.0, trunk mass 0 to 1.5 kg, centre of mass +-0.1 m,
+gain multipliers 0.8 to 1.2 per joint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from agility_rl.go2 import constants
+
+
+@dataclass(frozen=True)
+class Randomization:
+    """Closed intervals from which parameters are drawn uniformly; an interval of one value switches a draw off."""
+
+    friction: tuple[float, float] = (0.6, 2.0)
+    trunk_mass: tuple[float, float] = (0.0, 1.5)
+    """Added mass [kg]."""
+    trunk_com: tuple[float, float] = (-0.1, 0.1)
+    """Offset of the centre of mass on each axis [m]."""
+    gain: tuple[float, float] = (0.8, 1.2)
+    """Multipliers of stiffness and damping, per joint."""
+    action_delay: tuple[float, float] = (0.0, 0.0)
+    """Seconds between a target and its arrival at the motors."""
+
+
+NOMINAL = Randomization((1.0, 1.0), (0.0, 0.0), (0.0, 0.0), (1.0, 1.0), (0.0, 0.0))
+
+
+def uniform(shape: tuple[int, ...], interval: tuple[float, float], generator: torch.Generator) -> Tensor:
+    """Uniform draw of a closed interval.
+
+    Raises:
+        ValueError: if the interval is reversed.
+    """
+    low, high = interval
+    if low > high:
+        raise ValueError(f"an interval must be (low, high) with low <= high, got ({low}, {high})")
+    return low + (high - low) * torch.rand(shape, generator=generator)
+
+
+def sample_parameters(
+    num_robots: int, ranges: Randomization, generator: torch.Generator
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Draw simulator parameters and the privileged observation that describes them.
+
+    Returns:
+        ``(fields, privileged)``: fields for ``Simulator.set_parameters`` and float32 ``[N, 29]`` (added mass [kg],
+        centre of mass 3 [m], friction, stiffness multipliers - 1 (12), damping multipliers - 1 (12)).
+
+    Example:
+        >>> fields, privileged = sample_parameters(2, NOMINAL, torch.Generator())
+        >>> privileged[0, :5].tolist(), fields["stiffness"][0, 0].item()
+        ([0.0, 0.0, 0.0, 0.0, 1.0], 40.0)
+    """
+    friction = uniform((num_robots, 1), ranges.friction, generator)
+    mass = uniform((num_robots, 1), ranges.trunk_mass, generator)
+    com = uniform((num_robots, 3), ranges.trunk_com, generator)
+    stiffness = uniform((num_robots, 12), ranges.gain, generator)
+    damping = uniform((num_robots, 12), ranges.gain, generator)
+    delay = uniform((num_robots, 1), ranges.action_delay, generator)
+    fields = {
+        "ground_friction": friction,
+        "trunk_mass_offset": mass,
+        "trunk_com_offset": com,
+        "stiffness": stiffness * constants.STIFFNESS,
+        "damping": damping * constants.DAMPING,
+        "action_delay": delay,
+    }
+    if not torch.count_nonzero(delay):
+        del fields["action_delay"]
+    return fields, torch.cat((mass, com, friction, stiffness - 1.0, damping - 1.0), -1)

@@ -1,0 +1,74 @@
+"""Reference-state initialisation: episodes start in the middle of a recorded motion of their own behaviour."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from agility_rl import behaviours
+from agility_rl.go2 import constants
+
+STATE_ENTRIES = (
+    "root_height",
+    "root_quaternion",
+    "root_linear_velocity",
+    "root_angular_velocity",
+    "joint_position",
+    "joint_velocity",
+)
+
+
+class ReferenceStates:
+    """States of recorded motion, sorted by skill, from which resets are drawn.
+
+    Source: method notes, section 4.2 (a random time of a random labelled clip of the drawn class).
+
+    Args:
+        states: TensorDict ``[M]`` with ``skill`` int64, ``root_height`` [M, 1] [m], ``root_quaternion`` [M, 4],
+            ``root_linear_velocity``, ``root_angular_velocity`` [M, 3] (world frame), ``joint_position``,
+            ``joint_velocity`` [M, 12].
+
+    Raises:
+        ValueError: if an entry is missing or a behaviour has no state.
+
+    Example:
+        >>> states = ReferenceStates.standing()
+        >>> states.sample(torch.tensor([0, 4]), torch.Generator())["joint_position"].shape
+        torch.Size([2, 12])
+    """
+
+    def __init__(self, states: TensorDictBase) -> None:
+        needed = {"skill", *STATE_ENTRIES}
+        if missing := needed - set(states.keys()):
+            raise ValueError(f"reference states lack {', '.join(sorted(missing))}; they have {sorted(states.keys())}")
+        self.count = torch.bincount(states["skill"], minlength=behaviours.NUM_BEHAVIOURS)
+        empty = [name for name, number in zip(behaviours.BEHAVIOURS, self.count.tolist(), strict=True) if not number]
+        if empty:
+            raise ValueError(f"no reference state for {', '.join(empty)}; give at least one for each behaviour")
+        self.first = torch.cumsum(self.count, 0) - self.count
+        self.states = states.select(*STATE_ENTRIES)[torch.argsort(states["skill"], stable=True)]
+
+    @classmethod
+    def standing(cls) -> ReferenceStates:
+        """One state for all behaviours: standing in the default pose."""
+        n = behaviours.NUM_BEHAVIOURS
+        return cls(
+            TensorDict(
+                {
+                    "skill": torch.arange(n),
+                    "root_height": torch.full((n, 1), constants.STANDING_HEIGHT),
+                    "root_quaternion": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
+                    "root_linear_velocity": torch.zeros(n, 3),
+                    "root_angular_velocity": torch.zeros(n, 3),
+                    "joint_position": torch.tensor(constants.DEFAULT_POSE).repeat(n, 1),
+                    "joint_velocity": torch.zeros(n, constants.NUM_JOINTS),
+                },
+                [n],
+            )
+        )
+
+    def sample(self, skill: Tensor, generator: torch.Generator) -> TensorDictBase:
+        """A random state of each given skill, ``[N]``."""
+        fraction = torch.rand(skill.shape, generator=generator)
+        return self.states[self.first[skill] + (fraction * self.count[skill]).long()]

@@ -1,0 +1,62 @@
+"""What the terms of an environment may look at after one control step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass
+class LocomotionState:
+    """Physical state, last actions and commands of ``N`` robots; every reward and termination is a function of it.
+
+    Attributes:
+        root_height: ``[N, 1]`` trunk height over the terrain [m].
+        roll: ``[N]`` [rad].
+        pitch: ``[N]`` [rad].
+        yaw: ``[N]`` [rad].
+        linear_velocity: ``[N, 3]`` [m/s], base frame.
+        angular_velocity: ``[N, 3]`` [rad/s], base frame.
+        joint_position: ``[N, 12]`` [rad].
+        joint_velocity: ``[N, 12]`` [rad/s].
+        previous_joint_velocity: ``[N, 12]`` one control step earlier.
+        torque: ``[N, 12]`` PD torque before the limits [N m].
+        previous_torque: ``[N, 12]``.
+        action: ``[N, 12]``.
+        previous_action: ``[N, 12]``.
+        trunk_contact: ``[N]`` force on the trunk [N].
+        hip_contact: ``[N, 4]`` [N].
+        thigh_contact: ``[N, 4]`` [N].
+        calf_contact: ``[N, 4]`` [N].
+        foot_contact: ``[N, 4]`` [N].
+        command: ``[N, 5]`` in the order of :data:`agility_rl.behaviours.COMMANDS`.
+        jumping: bool ``[N]``, the skill is jump.
+        peak_height: ``[N]`` highest trunk of the last 0.9 s [m].
+        unstable: bool ``[N]``, the engine reported divergence.
+        dt: control step [s].
+    """
+
+    root_height: Tensor
+    roll: Tensor
+    pitch: Tensor
+    yaw: Tensor
+    linear_velocity: Tensor
+    angular_velocity: Tensor
+    joint_position: Tensor
+    joint_velocity: Tensor
+    previous_joint_velocity: Tensor
+    torque: Tensor
+    previous_torque: Tensor
+    action: Tensor
+    previous_action: Tensor
+    trunk_contact: Tensor
+    hip_contact: Tensor
+    thigh_contact: Tensor
+    calf_contact: Tensor
+    foot_contact: Tensor
+    command: Tensor
+    jumping: Tensor
+    peak_height: Tensor
+    unstable: Tensor
+    dt: float

@@ -1,0 +1,20 @@
+"""Conditions that end an episode as a failure: plain functions of a state, each ``-> bool [N]``."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from agility_rl.envs.state import LocomotionState
+
+TERMINATION_FORCE = 1.0
+"""Force on trunk or hip that ends an episode [N] (released code)."""
+
+
+def body_contact(state: LocomotionState) -> Tensor:
+    """Trunk (head included) or a hip presses on something with more than 1 N (method notes, section 4.2)."""
+    return (state.trunk_contact > TERMINATION_FORCE) | (state.hip_contact > TERMINATION_FORCE).any(-1)
+
+
+def diverged(state: LocomotionState) -> Tensor:
+    """The engine reported a bad position, velocity, acceleration or control."""
+    return state.unstable

@@ -1,0 +1,1 @@
+"""The Unitree Go2 as data: constants, model, kinematics and features."""

@@ -1,0 +1,57 @@
+"""Default TensorDict keys of the package, each with shape and unit.
+
+Shapes: ``*B`` any leading batch, ``T`` time, ``J`` = 12 joints (FL, FR, RL, RR x hip, thigh, calf), ``K`` = 5 skills,
+``H`` = 2 discriminator frames, ``F`` = 49 features of one frame, ``P`` = 45 proprioceptive numbers.
+Every component takes other keys; these are what they use when none are given.
+"""
+
+from __future__ import annotations
+
+ACTION = "action"
+"""float32 ``[*B, J]``, joint targets in units of the action scale around the default pose."""
+
+PROPRIOCEPTION = "proprioception"
+"""float32 ``[*B, P]``, what the robot measures; layout in :data:`agility_rl.go2.features.PROPRIOCEPTION_LAYOUT`."""
+
+EXPLICIT = "explicit"
+"""float32 ``[*B, 4]``, true trunk height [m] and base-frame linear velocity x 0.5 [m/s]: the estimator's target."""
+
+ESTIMATE = "estimate"
+"""float32 ``[*B, 4]``, the state estimator's guess of :data:`EXPLICIT`."""
+
+PRIVILEGED = "privileged"
+"""float32 ``[*B, 29]``, trunk mass offset [kg], centre-of-mass offset 3 [m], friction, gain multipliers - 1 (12 + 12)."""
+
+HISTORY = "history"
+"""float32 ``[*B, 10, P]``, the newest proprioceptions, oldest first, the present one included."""
+
+LATENT = "latent"
+"""float32 ``[*B, 29]``, encoding of the privileged quantities or of the history."""
+
+COMMAND = "command"
+"""float32 ``[*B, 11]``, v_x, v_y [m/s], yaw rate [rad/s], jump height, locomotion height [m], shift, one-hot skill."""
+
+PEAK = "peak"
+"""float32 ``[*B, 1]``, highest trunk position [m] of the last 0.9 s while jumping, else 0."""
+
+MOTION = "motion"
+"""float32 ``[*B, H, F]``, consecutive discriminator frames, oldest first."""
+
+SKILL = "skill"
+"""int64 ``[*B]``, index into :data:`agility_rl.behaviours.BEHAVIOURS`; the latent c, or a label."""
+
+SHIFT = "shift"
+"""float32 ``[*B, 1]``, the latent shifting variable epsilon in [-1, 1]."""
+
+DISCRIMINATOR_LOGIT = "discriminator_logit"
+"""float32 ``[*B, 1]``, D(o): trained towards +1 on dogs and -1 on the policy (least squares)."""
+
+SKILL_LOGITS = "skill_logits"
+"""float32 ``[*B, K]``, unnormalised log Q^c(. | o)."""
+
+SHIFT_ESTIMATE = "shift_estimate"
+"""float32 ``[*B, 1]``, Q^epsilon(o)."""
+
+REWARD_TERMS = "reward_terms"
+"""nested: one float32 ``[*B, 1]`` per reward term, already multiplied by weight and time step."""
+

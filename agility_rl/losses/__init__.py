@@ -1,0 +1,9 @@
+"""Losses: LossModules over the pure functions of :mod:`agility_rl.losses.functional`; no network, no environment."""
+
+from __future__ import annotations
+
+from agility_rl.losses.adaptation import AdaptationLoss, StateEstimationLoss
+from agility_rl.losses.discriminator import DiscriminatorLoss
+from agility_rl.losses.predictor import PredictorLoss
+
+__all__ = ["AdaptationLoss", "DiscriminatorLoss", "PredictorLoss", "StateEstimationLoss"]

@@ -1,0 +1,278 @@
+"""Many robots on the CPU: ``mujoco.batch`` on a pool of C++ threads."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch, SimulationError
+from torch import Tensor
+
+from agility_rl.go2 import constants
+from agility_rl.go2.model import ROBOT_GROUP, build_spec
+from agility_rl.simulation.simulator import PARAMETERS
+from agility_rl.simulation.terrain import HeightField
+
+_WARNINGS = [
+    int(warning)
+    for warning in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+        mujoco.mjtWarning.mjWARN_BADCTRL,
+    )
+]
+_NUM_FORCES = 3 * len(constants.CONTACT_GROUPS)
+_TERRAIN_MARGIN = 2.0
+"""Robots start at least this far from the edge of a height field [m]."""
+_FLAT = {
+    "joint_damping": ("dof_damping", slice(6, None)),
+    "armature": ("dof_armature", slice(6, None)),
+    "friction_loss": ("dof_frictionloss", slice(6, None)),
+}
+
+
+class BatchSimulator:
+    """:class:`agility_rl.simulation.Simulator` on the CPU, results independent of the number of threads.
+
+    The PD controller is the engine's position actuator and runs in every physics step. Contact forces are those of
+    the last physics step of a control step. Parameters become per-simulation model fields when they are first set.
+
+    Args:
+        num_simulations: N.
+        num_threads: C++ threads; by default the CPUs that this process may use.
+        control_dt: control step [s], a multiple of ``sim_dt``.
+        sim_dt: physics step [s].
+        terrain: height field instead of a plane.
+        **model_options: keyword arguments of :func:`agility_rl.go2.model.build_spec`.
+
+    Raises:
+        ValueError: if the steps do not fit each other or a number is not positive.
+
+    Example:
+        >>> simulator = BatchSimulator(2, num_threads=1)
+        >>> simulator.step(torch.tensor(constants.DEFAULT_POSE).expand(2, 12))
+        >>> simulator.contact_force.shape
+        torch.Size([2, 17])
+    """
+
+    def __init__(
+        self,
+        num_simulations: int,
+        *,
+        num_threads: int | None = None,
+        control_dt: float = constants.CONTROL_DT,
+        sim_dt: float = constants.SIM_DT,
+        terrain: HeightField | None = None,
+        **model_options: Any,
+    ) -> None:
+        substeps = control_dt / sim_dt
+        if num_simulations < 1:
+            raise ValueError(f"num_simulations must be at least 1, got {num_simulations}")
+        if abs(substeps - round(substeps)) > 1e-6 or round(substeps) < 1:
+            raise ValueError(f"control_dt must be a multiple of sim_dt, got {control_dt} and {sim_dt} s")
+        self.num_simulations = num_simulations
+        self.num_threads = num_threads or len(os.sched_getaffinity(0))
+        self.control_dt, self.sim_dt, self.substeps = control_dt, sim_dt, round(substeps)
+        self.terrain = terrain
+        self.ground_extent = 0.0 if terrain is None else min(terrain.half_size) - _TERRAIN_MARGIN
+        if terrain is not None:
+            model_options |= {"heights": terrain.heights.numpy(), "height_field_size": terrain.half_size}
+        self.model: mujoco.MjModel = build_spec(sim_dt=sim_dt, **model_options).compile()
+        self.batch = Batch(self.model, num_simulations, self.num_threads)
+        self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self._ctrl, self._sensordata = self.batch.bind("ctrl"), self.batch.bind("sensordata")
+        self._parameters: dict[str, Tensor] = {}
+        self._delay_steps: Tensor | None = None
+        self._previous_target = torch.tensor(constants.DEFAULT_POSE).repeat(num_simulations, 1)
+        self._warned = self._warning_count()
+        self.unstable = torch.zeros(num_simulations, dtype=torch.bool)
+        self._qpos[:, 7:] = self._ctrl[:] = constants.DEFAULT_POSE
+        self.batch.forward()
+        self._read()
+
+    def step(self, target: Tensor) -> None:
+        """Hold joint position targets ``[N, 12]`` [rad] for one control step."""
+        failed = None
+        try:
+            if self._delay_steps is None:
+                self._ctrl[:] = target.numpy()
+                self.batch.step(nstep=self.substeps)
+            else:
+                self._step_delayed(target)
+        except SimulationError as error:
+            failed = error.ids
+        self._previous_target = target.clone()
+        count = self._warning_count()
+        self.unstable = torch.from_numpy(count != self._warned)
+        self._warned = count
+        self._read()
+        if failed is not None:
+            self.unstable[torch.as_tensor(failed)] = True
+
+    def _step_delayed(self, target: Tensor) -> None:
+        """Step one physics step at a time; each simulation takes its new target after its own delay."""
+        assert self._delay_steps is not None
+        new, old = target.numpy(), self._previous_target.numpy()
+        delay = self._delay_steps.numpy()
+        edges = sorted({0, self.substeps, *np.unique(delay[delay < self.substeps]).tolist()})
+        for start, end in zip(edges[:-1], edges[1:], strict=True):
+            self._ctrl[:] = np.where(delay[:, None] <= start, new, old)
+            self.batch.step(nstep=end - start)
+
+    def reset(
+        self,
+        mask: Tensor,
+        *,
+        root_position: Tensor,
+        root_quaternion: Tensor,
+        root_linear_velocity: Tensor,
+        root_angular_velocity: Tensor,
+        joint_position: Tensor,
+        joint_velocity: Tensor,
+    ) -> None:
+        """Put the rows of a bool mask ``[N]`` into given states; the other rows stay bit-identical."""
+        ids = mask.numpy()
+        if not ids.any():
+            return
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self._qpos[ids] = torch.cat((root_position, root_quaternion, joint_position), -1)[mask].numpy()
+        self._qvel[ids] = torch.cat((root_linear_velocity, root_angular_velocity, joint_velocity), -1)[mask].numpy()
+        self._ctrl[ids] = joint_position[mask].numpy()
+        self._previous_target = torch.where(mask[:, None], joint_position, self._previous_target)
+        self.batch.forward(ids)
+        self._warned[ids] = self._warning_count()[ids]
+        self.unstable = self.unstable & ~mask
+        self._read()
+
+    def _read(self) -> None:
+        qpos = torch.from_numpy(self._qpos.astype(np.float32))
+        qvel = torch.from_numpy(self._qvel.astype(np.float32))
+        self.root_position, self.root_quaternion, self.joint_position = qpos[:, :3], qpos[:, 3:7], qpos[:, 7:]
+        self.root_linear_velocity, self.root_angular_velocity = qvel[:, :3], qvel[:, 3:6]
+        self.joint_velocity = qvel[:, 6:]
+        forces = torch.from_numpy(self._sensordata[:, :_NUM_FORCES].astype(np.float32))
+        self.contact_force = torch.linalg.vector_norm(forces.unflatten(-1, (-1, 3)), dim=-1)
+
+    def _warning_count(self) -> np.ndarray:
+        return self.batch.warning[:, _WARNINGS, 1].sum(-1)
+
+    def set_parameters(self, mask: Tensor, **fields: Tensor) -> None:
+        """Change parameters of :data:`PARAMETERS` in the rows of a bool mask; each value is ``[N, size]``.
+
+        Raises:
+            ValueError: if a parameter is unknown or has a wrong shape.
+        """
+        rows = mask.numpy()
+        for name, value in fields.items():
+            if name not in PARAMETERS:
+                raise ValueError(f"unknown parameter {name!r}; expected one of {', '.join(PARAMETERS)}")
+            shape = (self.num_simulations, PARAMETERS[name][0])
+            if tuple(value.shape) != shape:
+                raise ValueError(f"{name} must be {list(shape)}, got {list(value.shape)}")
+            self._parameters[name] = torch.where(mask[:, None], value.float(), self.parameter(name))
+            self._write(name, rows, self._parameters[name])
+        if rows.any() and {"trunk_mass_offset", "trunk_com_offset", "armature"} & set(fields):
+            self.batch.set_const(rows)
+
+    def parameter(self, name: str) -> Tensor:
+        """Present value ``[N, size]`` of a parameter."""
+        if name in self._parameters:
+            return self._parameters[name]
+        model, size = self.model, PARAMETERS[name][0]
+        nominal = {
+            "stiffness": lambda: model.actuator_gainprm[:, 0],
+            "damping": lambda: -model.actuator_biasprm[:, 2],
+            "torque_limit": lambda: model.actuator_forcerange[:, 1],
+            "ground_friction": lambda: model.geom("floor").friction[:1],
+            "trunk_mass_offset": lambda: np.zeros(1),
+            "trunk_com_offset": lambda: np.zeros(3),
+            "action_delay": lambda: np.zeros(1),
+            **{key: (lambda f=field, s=part: getattr(model, f)[s]) for key, (field, part) in _FLAT.items()},
+        }[name]()
+        return torch.as_tensor(np.array(nominal), dtype=torch.float32).reshape(1, size).repeat(self.num_simulations, 1)
+
+    def _write(self, name: str, rows: np.ndarray, value: Tensor) -> None:
+        batch, model = self.batch, self.model
+        new = value.numpy()[rows]
+        trunk, floor = model.body("trunk").id, model.geom("floor").id
+        if name == "stiffness":
+            batch.expand("actuator_gainprm")[rows, :, 0] = new
+            batch.expand("actuator_biasprm")[rows, :, 1] = -new
+        elif name == "damping":
+            batch.expand("actuator_biasprm")[rows, :, 2] = -new
+        elif name == "torque_limit":
+            batch.expand("actuator_forcerange")[rows] = np.stack((-new, new), -1)
+        elif name == "ground_friction":
+            batch.expand("geom_friction")[rows, floor, 0] = new[:, 0]
+        elif name == "trunk_mass_offset":
+            nominal = model.body_mass[trunk]
+            mass = nominal + new[:, 0]
+            batch.expand("body_mass")[rows, trunk] = mass
+            batch.expand("body_inertia")[rows, trunk] = model.body_inertia[trunk] * (mass / nominal)[:, None]
+        elif name == "trunk_com_offset":
+            batch.expand("body_ipos")[rows, trunk] = model.body_ipos[trunk] + new
+        elif name == "action_delay":
+            steps = (value[:, 0] / self.sim_dt).round().long()
+            if bool((steps > self.substeps).any()):
+                raise ValueError(f"action_delay must be at most one control step, {self.control_dt} s")
+            self._delay_steps = steps if bool(steps.any()) else None
+        else:
+            field, part = _FLAT[name]
+            batch.expand(field)[rows, part] = new
+
+    def push(self, mask: Tensor, velocity: Tensor) -> None:
+        """Set the horizontal trunk velocity ``[N, 2]`` [m/s] of the rows of a bool mask."""
+        self._qvel[mask.numpy(), :2] = velocity[mask].numpy()
+
+    def ground_height(self, position: Tensor) -> Tensor:
+        """Height of the ground [m] under horizontal positions ``[N, 2]``, as ``[N]``."""
+        return torch.zeros(len(position)) if self.terrain is None else self.terrain.height_at(position)
+
+    def ray(self, origin: Tensor, direction: Tensor) -> Tensor:
+        """Distance [m] to the nearest surface that is not the robot, ``[N, R]``; infinite when there is none."""
+        groups = np.ones(6, dtype=np.uint8)
+        groups[ROBOT_GROUP] = 0
+        distance, _ = self.batch.ray(
+            origin.double().numpy(), torch.nn.functional.normalize(direction.double(), dim=-1).numpy(), groups
+        )[:2]
+        found = torch.from_numpy(np.array(distance, dtype=np.float32))
+        return torch.where(found < 0, torch.inf, found)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything an exact continuation needs: integration states, parameters, derived fields last read."""
+        return {
+            "state": torch.from_numpy(self.batch.state.copy()),
+            "parameters": {name: value.clone() for name, value in self._parameters.items()},
+            "previous_target": self._previous_target.clone(),
+            "contact_force": self.contact_force.clone(),
+            "unstable": self.unstable.clone(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if the state belongs to another model or number of simulations.
+        """
+        saved = state["state"].numpy()
+        if saved.shape != self.batch.state.shape:
+            raise ValueError(
+                f"simulator state must be {self.batch.state.shape}, got {saved.shape}; "
+                "resume with the number of robots and the model that wrote it"
+            )
+        everyone = torch.ones(self.num_simulations, dtype=torch.bool)
+        self.set_parameters(everyone, **dict(state["parameters"]))
+        self.batch.state[:] = saved
+        self._warned = self._warning_count()
+        self._read()
+        self._previous_target = state["previous_target"].clone()
+        self.contact_force = state["contact_force"].clone()
+        self.unstable = state["unstable"].clone()
+
+    def close(self) -> None:
+        """Release threads and memory; the simulator cannot be used afterwards."""
+        self.__dict__.pop("batch", None)

@@ -1,0 +1,125 @@
+"""What an environment needs of a physics engine."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from torch import Tensor
+
+PARAMETERS: dict[str, tuple[int, str]] = {
+    "stiffness": (12, "N m/rad"),
+    "damping": (12, "N m s/rad"),
+    "joint_damping": (12, "N m s/rad"),
+    "armature": (12, "kg m^2"),
+    "friction_loss": (12, "N m"),
+    "torque_limit": (12, "N m"),
+    "ground_friction": (1, "1"),
+    "trunk_mass_offset": (1, "kg"),
+    "trunk_com_offset": (3, "m"),
+    "action_delay": (1, "s"),
+}
+"""Parameters that may differ between simulations: number of values and unit."""
+
+
+class Simulator(Protocol):
+    """``N`` simulations of one robot, stepped together.
+
+    All tensors are float32, rows are simulations, and every state tensor is new after :meth:`step` and :meth:`reset`,
+    so that it may be kept.
+
+    Attributes:
+        num_simulations: N.
+        control_dt: seconds of one :meth:`step`.
+        sim_dt: seconds of one physics step.
+        ground_extent: half side of the square in which robots may start [m]; 0 on the plane.
+        root_position: ``[N, 3]`` [m], world frame.
+        root_quaternion: ``[N, 4]`` (w, x, y, z).
+        root_linear_velocity: ``[N, 3]`` [m/s], world frame.
+        root_angular_velocity: ``[N, 3]`` [rad/s], base frame.
+        joint_position: ``[N, 12]`` [rad].
+        joint_velocity: ``[N, 12]`` [rad/s].
+        contact_force: ``[N, 17]`` [N], net force on each group of :data:`agility_rl.go2.constants.CONTACT_GROUPS`.
+        unstable: bool ``[N]``, the engine reported divergence in the last step.
+    """
+
+    num_simulations: int
+    control_dt: float
+    sim_dt: float
+    ground_extent: float
+    root_position: Tensor
+    root_quaternion: Tensor
+    root_linear_velocity: Tensor
+    root_angular_velocity: Tensor
+    joint_position: Tensor
+    joint_velocity: Tensor
+    contact_force: Tensor
+    unstable: Tensor
+
+    def step(self, target: Tensor) -> None:
+        """Hold joint position targets ``[N, 12]`` [rad] for one control step."""
+        ...
+
+    def reset(
+        self,
+        mask: Tensor,
+        *,
+        root_position: Tensor,
+        root_quaternion: Tensor,
+        root_linear_velocity: Tensor,
+        root_angular_velocity: Tensor,
+        joint_position: Tensor,
+        joint_velocity: Tensor,
+    ) -> None:
+        """Put the rows of a bool mask ``[N]`` into given states; the other rows stay bit-identical."""
+        ...
+
+    def set_parameters(self, mask: Tensor, **fields: Tensor) -> None:
+        """Change parameters of :data:`PARAMETERS` in the rows of a bool mask; each value is ``[N, size]``."""
+        ...
+
+    def push(self, mask: Tensor, velocity: Tensor) -> None:
+        """Set the horizontal trunk velocity ``[N, 2]`` [m/s] of the rows of a bool mask."""
+        ...
+
+    def ground_height(self, position: Tensor) -> Tensor:
+        """Height of the ground [m] under horizontal positions ``[N, 2]``, as ``[N]``."""
+        ...
+
+    def ray(self, origin: Tensor, direction: Tensor) -> Tensor:
+        """Distance [m] to the nearest surface that is not the robot, ``[N, R]``; infinite when there is none."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything an exact continuation needs."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        ...
+
+    def close(self) -> None:
+        """Release threads and memory."""
+        ...
+
+
+def make_simulator(name: str = "batch", *, num_simulations: int, **options: Any) -> Simulator:
+    """Build a simulator by name.
+
+    Args:
+        name: ``"batch"`` (CPU, ``mujoco.batch``).
+        num_simulations: N.
+        **options: keyword arguments of the simulator's class.
+
+    Raises:
+        ValueError: if there is no simulator of this name.
+
+    Example:
+        >>> simulator = make_simulator(num_simulations=2, num_threads=1)
+        >>> simulator.root_position.shape
+        torch.Size([2, 3])
+    """
+    if name != "batch":
+        raise ValueError(f"unknown simulator {name!r}; expected 'batch' (CPU)")
+    from agility_rl.simulation.batch import BatchSimulator
+
+    return BatchSimulator(num_simulations, **options)

@@ -1,0 +1,129 @@
+"""What share of the bare physics engine's speed is left in ``LocomotionEnv``?
+
+Bare ``mujoco.batch.Batch.step``, our simulator, the environment, and the environment with resets run in turns, with the
+same model, robots, substeps, threads and targets, so that their ratio does not depend on what else the machine does.
+
+    python benchmarks/env_step.py --robots 1024 --threads 2
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from collections.abc import Callable
+
+import mujoco
+import mujoco.batch
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from agility_rl import keys
+from agility_rl.envs import LocomotionEnv
+from agility_rl.envs.randomization import Randomization
+from agility_rl.go2 import constants
+from agility_rl.go2.model import build_spec
+from agility_rl.simulation import make_simulator
+
+SIM_DT, CONTROL_DT = 0.005, 0.02
+
+
+def bare(robots: int, threads: int) -> Callable[[Tensor], None]:
+    """The engine alone: write the targets, step."""
+    model = build_spec(sim_dt=SIM_DT).compile()
+    batch = mujoco.batch.Batch(model, robots, threads)
+    joints = [model.jnt_qposadr[model.joint(name).id] for name in constants.JOINT_NAMES]
+    position = batch.bind("qpos")
+    position[:] = model.qpos0
+    position[:, 2] = constants.STANDING_HEIGHT + 0.005
+    position[:, joints] = constants.DEFAULT_POSE
+    batch.forward()
+    control = batch.bind("ctrl")
+    substeps = round(CONTROL_DT / SIM_DT)
+
+    def step(target: Tensor) -> None:
+        control[:] = target.numpy()
+        batch.step(nstep=substeps)
+
+    return step
+
+
+def simulator(robots: int, threads: int) -> Callable[[Tensor], None]:
+    """Our simulator: the same and the state as float32 tensors."""
+    simulation = make_simulator(num_simulations=robots, num_threads=threads, sim_dt=SIM_DT, control_dt=CONTROL_DT)
+    n = robots
+    simulation.reset(
+        torch.ones(n, dtype=torch.bool),
+        root_position=torch.tensor([0.0, 0.0, constants.STANDING_HEIGHT + 0.005]).repeat(n, 1),
+        root_quaternion=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+        root_linear_velocity=torch.zeros(n, 3),
+        root_angular_velocity=torch.zeros(n, 3),
+        joint_position=torch.tensor(constants.DEFAULT_POSE).repeat(n, 1),
+        joint_velocity=torch.zeros(n, 12),
+    )
+    return simulation.step
+
+
+def environment(robots: int, threads: int, full: bool, resets: bool) -> Callable[[Tensor], None]:
+    """The environment: observations, rewards, commands; ``full`` adds noise, randomisation and pushes."""
+    options = {"randomization": Randomization(), "observation_noise": 1.0, "push_interval": 8.0} if full else {}
+    env = LocomotionEnv(
+        robots,
+        simulator_options={"num_threads": threads, "sim_dt": SIM_DT, "control_dt": CONTROL_DT},
+        **options,
+    )
+    carrier = env.reset()
+    pose, scale = torch.tensor(constants.DEFAULT_POSE), torch.tensor(constants.ACTION_SCALE)
+
+    def step(target: Tensor) -> None:
+        nonlocal carrier
+        action = (target - pose) / scale
+        if resets:
+            carrier[keys.ACTION] = action
+            carrier = env.step_and_maybe_reset(carrier)[1]
+        else:
+            env.step(TensorDict({keys.ACTION: action}, [robots]))
+
+    return step
+
+
+def main() -> None:
+    """Run all contenders in turns and print their rates."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robots", type=int, default=1024)
+    parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--rounds", type=int, default=10, help="turns that each contender gets")
+    parser.add_argument("--steps", type=int, default=25, help="control steps a turn")
+    options = parser.parse_args()
+    robots, threads = options.robots, options.threads
+    contenders = {
+        "bare Batch.step": bare(robots, threads),
+        "simulator": simulator(robots, threads),
+        "env.step": environment(robots, threads, full=False, resets=False),
+        "env.step, noise, randomised, pushed": environment(robots, threads, full=True, resets=False),
+        "the same with resets": environment(robots, threads, full=True, resets=True),
+    }
+    generator = torch.Generator().manual_seed(0)
+    # Robots that shift their weight about the default pose: all contenders keep four feet on the ground.
+    offset = 0.05 * torch.randn(options.steps, robots, 12, generator=generator)
+    targets = torch.tensor(constants.DEFAULT_POSE) + offset
+    seconds: dict[str, list[float]] = {name: [] for name in contenders}
+    for turn in range(options.rounds + 1):
+        for name, step in contenders.items():
+            start = time.perf_counter()
+            for target in targets:
+                step(target)
+            if turn:  # the first turn warms up
+                seconds[name].append(time.perf_counter() - start)
+    print(f"{robots} robots, {threads} threads, {torch.get_num_threads()} torch threads, load {os.getloadavg()[0]:.1f}")
+    reference = seconds["bare Batch.step"]
+    for name, times in seconds.items():
+        rate = robots * options.steps / statistics.median(times)
+        share = statistics.median(one / other for one, other in zip(reference, times, strict=True))
+        print(f"{name:38} {rate:10.0f} steps/s {share:8.1%} of bare")
+
+
+if __name__ == "__main__":
+    main()

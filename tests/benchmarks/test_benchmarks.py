@@ -1,0 +1,28 @@
+"""The benchmarks run, on a few robots; what they measure is not looked at here."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def run(repository: Path, *arguments: str) -> str:
+    command = [sys.executable, *arguments]
+    done = subprocess.run(command, cwd=repository, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_env_step_prints_a_share_of_the_bare_engine(repository: Path) -> None:
+    output = run(repository, "benchmarks/env_step.py", "--robots=4", "--threads=1", "--rounds=1", "--steps=2")
+    assert "bare Batch.step" in output and output.count("% of bare") == 5
+
+
+@pytest.mark.slow
+def test_plain_loop_and_recipe_run_in_turns(repository: Path) -> None:
+    output = run(repository, "benchmarks/plain_ppo.py", "--preset=smoke", "--robots=4", "--iterations=1", "--warmup=0")
+    assert "speed of the recipe relative to the plain loop" in output and "nan" not in output
