@@ -32,6 +32,7 @@ from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.randomization import Randomization
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm, jump_height_peak, jump_height_window
+from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, thigh_contact
 from agility_rl.go2 import features
 from agility_rl.losses import AdaptationLoss, DiscriminatorLoss, PredictorLoss, StateEstimationLoss, functional
 from agility_rl.modules import (
@@ -79,6 +80,10 @@ class EnvConfig:
     jump_reward: str = "peak"
     """``window`` as released, or ``peak``: the highest trunk of the last 0.9 s."""
     jump_weight: float = 6.0
+    collision_weight: float = -10.0
+    """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
+    end_when_sitting: bool = False
+    """Contact of a thigh ends the episode too, as in stage 3."""
     friction_loss: float = 0.2
     """Dry friction of the joints [N m]; 0 as in the released simulation is a tenth faster."""
     num_threads: int | None = None
@@ -187,8 +192,8 @@ PAPER = Config(
 CPU = Config(
     iterations=1000,
     max_minutes=58.0,
-    env=EnvConfig(friction_loss=0.0),
-    ppo=PPOConfig(epochs=5, minibatches=8, max_learning_rate=2e-3, entropy=0.002, critic_history=False),
+    env=EnvConfig(friction_loss=0.0, collision_weight=-2.0, end_when_sitting=True),
+    ppo=PPOConfig(epochs=3, minibatches=6, max_learning_rate=2e-3, entropy=0.0005, initial_std=0.5, critic_history=False),
     imitation=ImitationConfig(
         conditional=True,
         labelled_share=0.5,
@@ -388,6 +393,7 @@ def build(cfg: Config) -> Components:
     terms = dict(LOCOMOTION_REWARDS)
     jump = {"peak": jump_height_peak, "window": jump_height_window}[cfg.env.jump_reward]
     terms["jump_height"] = RewardTerm(cfg.env.jump_weight, jump)
+    terms["collision"] = terms["collision"]._replace(weight=cfg.env.collision_weight)
     skills = torch.arange(len(BEHAVIOURS)).repeat_interleave(2000)
     reference = dataset.sample_states(skills, seeds.generator("reference"))
     env = LocomotionEnv(
@@ -399,6 +405,7 @@ def build(cfg: Config) -> Components:
         },
         reference=reference.set("skill", skills),
         rewards=terms,
+        terminations=(*LOCOMOTION_TERMINATIONS, *([thigh_contact] if cfg.env.end_when_sitting else [])),
         randomization=Randomization(action_delay=(0.0, cfg.env.action_delay)) if cfg.env.randomize else None,
         observation_noise=cfg.env.observation_noise,
         push_interval=cfg.env.push_interval,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -18,7 +18,7 @@ from agility_rl.envs.randomization import NOMINAL, Randomization, sample_paramet
 from agility_rl.envs.reference import ReferenceStates
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm
 from agility_rl.envs.state import LocomotionState
-from agility_rl.envs.terminations import body_contact, diverged
+from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, Termination
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator, make_simulator
 
@@ -62,6 +62,7 @@ class LocomotionEnv(EnvBase):
         reference: states for reference-state initialisation as :class:`ReferenceStates` takes them; ``None`` starts
             from standing.
         rewards: reward terms by name.
+        terminations: failures; an episode ends when one of them holds.
         randomization: ranges of physical parameters, drawn anew at each reset; ``None`` leaves the model nominal.
         observation_noise: factor on the noise of :data:`agility_rl.go2.features.PROPRIOCEPTION_LAYOUT`.
         episode_length: seconds until truncation.
@@ -91,6 +92,7 @@ class LocomotionEnv(EnvBase):
         simulator_options: Mapping[str, Any] | None = None,
         reference: TensorDictBase | None = None,
         rewards: Mapping[str, RewardTerm] = LOCOMOTION_REWARDS,
+        terminations: Sequence[Termination] = LOCOMOTION_TERMINATIONS,
         randomization: Randomization | None = None,
         observation_noise: float = 0.0,
         episode_length: float = 20.0,
@@ -105,6 +107,7 @@ class LocomotionEnv(EnvBase):
             raise ValueError(f"the simulator holds {self.simulator.num_simulations} robots, expected {num_robots}")
         self.dt = self.simulator.control_dt
         self.rewards = dict(rewards)
+        self.terminations = tuple(terminations)
         self.randomization = randomization
         self.max_steps = round(episode_length / self.dt)
         self.push_steps = None if push_interval is None else round(push_interval / self.dt)
@@ -221,7 +224,7 @@ class LocomotionEnv(EnvBase):
             for name, term in self.rewards.items()
         }
         reward = torch.cat(tuple(terms.values()), -1).sum(-1, keepdim=True).clamp(min=0.0)
-        terminated = (body_contact(state) | diverged(state))[:, None]
+        terminated = torch.stack([failed(state) for failed in self.terminations]).any(0)[:, None]
         truncated = (self._step_count >= self.max_steps)[:, None] & ~terminated
 
         self.commands.advance()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -98,12 +99,14 @@ def build_spec(
     trunk.add_freejoint(name="root")
     position, frame, mass = _TRUNK_INERTIAL
     _set_inertial(trunk, position, frame, mass, _TRUNK_INERTIA)
-    collide = {"contype": int(self_collision), "conaffinity": 1, "condim": 1, "group": ROBOT_GROUP}
+    collide: dict[str, Any] = {"contype": int(self_collision), "conaffinity": 1, "condim": 1, "group": ROBOT_GROUP}
     collide |= {"friction": (0.6, 0.005, 0.0001), "mass": 0.0, "rgba": (0.55, 0.57, 0.62, 1.0)}
     box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
     trunk.add_geom(name="trunk", type=box, size=(0.1881, 0.04675, 0.057), **collide)
     trunk.add_geom(name="head", type=cylinder, size=(0.05, 0.045, 0), pos=(0.285, 0, 0.01), **collide)
-    trunk.add_geom(name="snout", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(0.047, 0, 0), pos=(0.293, 0, -0.06), **collide)
+    trunk.add_geom(
+        name="snout", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(0.047, 0, 0), pos=(0.293, 0, -0.06), **collide
+    )
     trunk.add_site(name="imu", pos=constants.IMU_POSITION)
 
     gains = np.broadcast_to(stiffness, 12), np.broadcast_to(damping, 12)
@@ -117,9 +120,7 @@ def build_spec(
     return spec
 
 
-def _add_ground(
-    spec: mujoco.MjSpec, friction: float, heights: np.ndarray | None, size: tuple[float, float]
-) -> None:
+def _add_ground(spec: mujoco.MjSpec, friction: float, heights: np.ndarray | None, size: tuple[float, float]) -> None:
     floor = {"name": "floor", "contype": 1, "conaffinity": 0, "condim": 3, "friction": (friction, 0.005, 0.0001)}
     floor |= {"priority": 1, "rgba": (0.32, 0.36, 0.3, 1.0)}
     spec.worldbody.add_light(pos=(0, 0, 4), dir=(0.2, 0.2, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)

@@ -65,7 +65,7 @@ def read_bvh(path: str | Path) -> BVHMotion:
     """Parse a BVH file.
 
     Raises:
-        MotionError: if the file is missing or no BVH, its hierarchy is broken, or a frame has the wrong number of values.
+        MotionError: if the file is missing or no BVH, its hierarchy is broken, or a frame has too few or many values.
     """
     path = Path(path)
     try:
@@ -79,14 +79,14 @@ def read_bvh(path: str | Path) -> BVHMotion:
 
 
 def read_bvh_clip(path: str | Path) -> MotionClip:
-    """Read a BVH recording of the dog and retarget it to the Go2 with default settings.
+    """Read a BVH recording of the dog and retarget it to the Go2 with default settings, on the recording's own floor.
 
     Raises:
         MotionError: see :func:`read_bvh` and :func:`agility_rl.motion.retarget.retarget`.
     """
     from agility_rl.motion.retarget import retarget  # retarget reads through this module
 
-    return retarget(read_bvh(path))
+    return retarget(read_bvh(path), grounding=None)
 
 
 def forward(skeleton: Skeleton, values: Tensor) -> Tensor:
@@ -106,8 +106,8 @@ def forward(skeleton: Skeleton, values: Tensor) -> Tensor:
     Example:
         >>> channels = (("Zrotation", "Xrotation", "Yrotation"), ())
         >>> bone = Skeleton(("A", "A_End"), (-1, 0), torch.tensor([[0.0, 0, 0], [2.0, 0, 0]]), channels)
-        >>> forward(bone, torch.tensor([90.0, 0.0, 0.0]))[1].round(decimals=4)
-        tensor([0., 2., 0.])
+        >>> forward(bone, torch.tensor([90.0, 0.0, 0.0]))[1, 1]
+        tensor(2.)
     """
     batch = values.shape[:-1]
     offsets = skeleton.offsets.to(values)
@@ -206,7 +206,7 @@ def _parse_motion(lines: list[str], line: int, skeleton: Skeleton, path: Path) -
         if text.strip()
     ]
     if len(rows) != frames:
-        raise MotionError(f"{path}: expected the {frames} frames that its header announces, got {len(rows)}; truncated?")
+        raise MotionError(f"{path}: expected {frames} frames as its header announces, got {len(rows)}; truncated?")
     if frames < 2:
         raise MotionError(f"{path}: expected at least 2 frames, got {frames}")
     return dt, torch.from_numpy(np.asarray(rows, dtype=np.float64))

@@ -59,6 +59,13 @@ class MotionClip:
 
     Raises:
         MotionError: if shapes disagree, a number is not finite, or there are fewer than two frames.
+
+    Example:
+        >>> standing = torch.tensor(constants.DEFAULT_POSE).expand(51, 12)
+        >>> level = torch.tensor([1.0, 0, 0, 0]).expand(51, 4)
+        >>> clip = clip_from_joints("stand", 0.02, torch.tensor([0, 0, 0.2884]).expand(51, 3), level, standing)
+        >>> clip.duration, clip.foot_contact.all()
+        (1.0, tensor(True))
     """
 
     name: str

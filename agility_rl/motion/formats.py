@@ -65,6 +65,14 @@ def load_clip(
 
     Raises:
         MotionError: if the file is missing, damaged, of no known format or leg order, or the label is no behaviour.
+
+    Example:
+        >>> import tempfile
+        >>> from agility_rl.motion import synthesize_gait
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = clips.save(synthesize_gait("trot"), f"{folder}/trot_0.npz")
+        ...     load_clip(path, label="from name").label
+        'trot'
     """
     path = Path(path)
     if not path.is_file():
@@ -100,6 +108,12 @@ def load_clips(
 
     Raises:
         MotionError: if the folder is missing or holds no motion, or if one file cannot be read.
+
+    Example:
+        >>> load_clips("no/such/folder")
+        Traceback (most recent call last):
+        ...
+        agility_rl.motion.clip.MotionError: no/such/folder: expected a motion file or a folder of them, found ...
     """
     path = Path(path)
     if not path.exists():

@@ -22,7 +22,7 @@ from agility_rl.motion.clip import CONTROL_DT, MotionClip, MotionError, clip_fro
 
 GRAVITY = 9.81
 MAX_HALF_STANCE = 0.16
-"""A foot stays at most this far [m] in front of or behind its neutral place; faster gaits shorten the stance instead."""
+"""A foot stays at most this far [m] in front of or behind its neutral place; faster gaits shorten the stance."""
 JUMP_CLEARANCE = 0.06
 """How much more the feet rise than the trunk during a jump [m]."""
 _FOOT_RADIUS = math.hypot(constants.HIP_OFFSET_X, constants.HIP_OFFSET_Y + constants.ABDUCTION)
@@ -61,7 +61,7 @@ class GaitPattern:
 
 
 PATTERNS: dict[str, GaitPattern] = {
-    # Hind foot, then the front foot of its side a fifth of a stride later: lateral phase .17 to .21, diagonal .29 to .33.
+    # Hind foot, then the front foot of its side a fifth of a stride later: lateral .17 to .21, diagonal .29 to .33.
     "walk": GaitPattern((0.20, 0.70, 0.0, 0.5), 0.68, (0.3, 0.15, 0.6), (0.55, 1.4), 0.31, 0.05, (0.004, 2)),
     # Both feet of a side, .03 apart.
     "pace": GaitPattern((0.03, 0.53, 0.0, 0.5), 0.50, (0.8, 0.5, 1.5), (1.3, 0.3), 0.32, 0.06, (0.006, 2)),
@@ -232,7 +232,7 @@ def _stride_timing(
         raise MotionError(f"expected a trunk height of 0.20 to 0.38 m, got {trunk}")
     phase = (torch.tensor(pattern.phase, dtype=torch.float64) + 0.01 * noise[2:6]) % 1.0
     cycle = 2 * torch.pi * (time * frequency + start)
-    # Lowest in the middle of the stances, where legs carry most: a cosine that starts at the mean mid-stance of the feet.
+    # Lowest in the middle of the stances, where legs carry most.
     times = pattern.bob[1]
     middle = 2 * torch.pi * (phase[0] + duty / 2)
     bob = -pattern.bob[0] * torch.cos(times * (cycle - middle))

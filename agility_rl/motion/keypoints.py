@@ -115,9 +115,7 @@ def read_keypoints(path: str | Path, dt: float = FRAME_TIME) -> Keypoints:
         fields = line.strip().rstrip(",").split(",")
         if len(fields) != columns:
             hint = "; a table of 87 columns holds poses, read its _joint_pos sibling" if len(fields) == 87 else ""
-            raise MotionError(
-                f"{path}, line {number}: expected {columns} columns (27 points), got {len(fields)}{hint}"
-            )
+            raise MotionError(f"{path}, line {number}: expected {columns} columns (27 points), got {len(fields)}{hint}")
         try:
             rows.append([float(field) for field in fields])
         except ValueError as error:
@@ -130,11 +128,11 @@ def read_keypoints(path: str | Path, dt: float = FRAME_TIME) -> Keypoints:
 
 
 def read_keypoint_clip(path: str | Path) -> MotionClip:
-    """Read a keypoint table and retarget it to the Go2 with default settings.
+    """Read a keypoint table and retarget it to the Go2 with default settings, on the recording's own floor.
 
     Raises:
         MotionError: see :func:`read_keypoints` and :func:`agility_rl.motion.retarget.retarget`.
     """
     from agility_rl.motion.retarget import retarget  # retarget reads through this module
 
-    return retarget(read_keypoints(path))
+    return retarget(read_keypoints(path), grounding=None)

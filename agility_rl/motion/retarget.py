@@ -21,7 +21,7 @@ from agility_rl.motion.edit import foot_slip, ground
 from agility_rl.motion.keypoints import Keypoints, read_keypoints
 
 SCALE = 0.7
-"""Go2 metres per dog metre: the released clips trot at 1.2 to 1.3 m/s where the dog trots at 1.7 to 2.0 (data notes)."""
+"""Go2 metres per dog metre: the released clips trot at 1.2 to 1.3 m/s where the dog does 1.7 to 2.0 (data notes)."""
 
 TRUNK_LIFT = 0.065
 """Added to the scaled trunk height [m]: the dog's 0.36 m between hips and shoulders become the Go2's 0.32 m."""
@@ -70,8 +70,8 @@ def retarget(
 ) -> MotionClip:
     """Retarget a dog recording to the Go2, at the recording's frame rate.
 
-    The trunk follows the middle of hips and shoulders, scaled and lifted. Each foot follows the scaled toe in the world,
-    shifted by a constant in the heading frame that puts its mean place under its hip,
+    The trunk follows the middle of hips and shoulders, scaled and lifted. Each foot follows the scaled toe, shifted by
+    a constant in the heading frame that puts its mean place under its hip,
 
     .. math:: p_i(t) = s\\, toe_i(t) + R_{yaw}(t) \\left(n_i - \\overline{s R_{yaw}^{-1} (toe_i - trunk)}\\right)
 
@@ -99,13 +99,24 @@ def retarget(
     Raises:
         MotionError: if the recording cannot be read, lacks the dog's points, a number is impossible, or the label is no
             behaviour.
+
+    Example:
+        >>> from agility_rl.motion.keypoints import POINTS
+        >>> dog = torch.zeros(30, 27, 3)
+        >>> for name, x, y in zip(_HIPS, (0.24, 0.24, -0.24, -0.24), (0.08, -0.08, 0.05, -0.05)):
+        ...     dog[:, POINTS.index(name)] = torch.tensor([x, y, 0.36])
+        >>> robot = retarget(Keypoints("standing", 1 / 60, dog))
+        >>> round(robot.root_position[0, 2].item(), 3), robot.foot_contact.all().item()
+        (0.317, True)
     """
     if label is not None and label not in BEHAVIOURS:
         raise MotionError(f"label {label!r} is no behaviour; expected one of {', '.join(BEHAVIOURS)}")
     if not 0.1 <= scale <= 3.0:
         raise MotionError(f"expected a scale of 0.1 to 3 robot metres per dog metre, got {scale}")
     if not 0.0 < hip_limit <= constants.JOINT_UPPER[0]:
-        raise MotionError(f"expected a hip limit of more than 0 and at most {constants.JOINT_UPPER[0]} rad, got {hip_limit}")
+        raise MotionError(
+            f"expected a hip limit of more than 0 and at most {constants.JOINT_UPPER[0]} rad, got {hip_limit}"
+        )
     points = _keypoints(motion)
     if start or stop is not None:
         points = points.slice(start, stop)
@@ -151,7 +162,9 @@ def _smooth_keypoints(points: Keypoints, deviation: float) -> Keypoints:
     """Gaussian low-pass over time; the inverse kinematics of a near-straight leg amplifies marker noise."""
     if deviation <= 0.0:
         return points
-    return replace(points, position=_gaussian(points.position.double().flatten(1), deviation / points.dt).view_as(points.position))
+    return replace(
+        points, position=_gaussian(points.position.double().flatten(1), deviation / points.dt).view_as(points.position)
+    )
 
 
 def _gaussian(value: Tensor, deviation: float) -> Tensor:
@@ -213,7 +226,9 @@ def _foot_targets(points: Keypoints, trunk: _Trunk, scale: float, lock_stance: b
 def _hold(target: Tensor, standing: Tensor) -> Tensor:
     """Correction ``[T, 2]`` that keeps a foot at its mean place in every stance and fades from one to the next."""
     correction = torch.zeros_like(target)
-    edges = torch.diff(standing.to(torch.int8), prepend=torch.zeros(1, dtype=torch.int8), append=torch.zeros(1, dtype=torch.int8))
+    edges = torch.diff(
+        standing.to(torch.int8), prepend=torch.zeros(1, dtype=torch.int8), append=torch.zeros(1, dtype=torch.int8)
+    )
     starts, ends = (edges == 1).nonzero().flatten().tolist(), (edges == -1).nonzero().flatten().tolist()
     last, last_value = 0, torch.zeros(2, dtype=target.dtype)
     for begin, end in zip(starts, ends, strict=True):

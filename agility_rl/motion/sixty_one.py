@@ -27,7 +27,7 @@ from agility_rl.motion.motion_json import unit_quaternion
 MAX_FOOT_ERROR = 0.03
 """A clip whose kinematics miss the stored feet by more than this, on average over one foot [m], is refused."""
 
-_PERMUTATIONS = tuple(itertools.permutations(range(4)))
+_ORDERS = torch.tensor(list(itertools.permutations(range(4))))
 _FRAMES = ("world", "base", "world axes from the root")
 _TIE = 2e-5
 """Conventions that differ by less [m] are told apart by their order of preference: they mean the same poses."""
@@ -109,34 +109,34 @@ def find_convention(
     hip_flip = torch.tensor([-1.0, 1.0, 1.0], dtype=joints.dtype)
     candidates = torch.stack((blocks, blocks * hip_flip))  # [sign, T, joint block, 3]
 
-    best: tuple[float, Convention] | None = None
+    best, best_error = None, torch.inf
     for robot in robots:
         computed = torch.stack([robot.leg(leg, candidates) for leg in range(4)])  # [leg, sign, T, joint block, 3]
         for frame, target in zip(_FRAMES, targets, strict=True):
             gap = (computed[..., None, :] - target[None, None, :, None]).norm(dim=-1)  # [leg, sign, T, joint, foot]
-            mean, worst = gap.mean(2), gap.max(2).values
+            mean, worst = gap.mean(2), gap.amax(2)
             sign = (mean[:, 1] < mean[:, 0] - _TIE).long()  # [leg, joint block, foot block]
-            cost = torch.where(sign == 1, mean[:, 1], mean[:, 0]).tolist()
-            for joint_blocks, foot_blocks in itertools.product(_PERMUTATIONS, _PERMUTATIONS):
-                errors = [cost[leg][joint_blocks[leg]][foot_blocks[leg]] for leg in range(4)]
-                if best is not None and sum(errors) / 4 >= best[0] - _TIE:
-                    continue
-                picks = [
-                    (leg, int(sign[leg, j, f]), j, f)
-                    for leg, (j, f) in enumerate(zip(joint_blocks, foot_blocks, strict=True))
-                ]
-                convention = Convention(
-                    robot=robot,
-                    joint_blocks=joint_blocks,
-                    hip_signs=tuple(-1 if s else 1 for _, s, _, _ in picks),
-                    foot_blocks=foot_blocks,
-                    foot_frame=frame,
-                    error=max(errors),
-                    max_error=max(float(worst[leg, s, j, f]) for leg, s, j, f in picks),
-                )
-                best = (sum(errors) / 4, convention)
-    assert best is not None
-    return best[1]
+            cost = mean.gather(1, sign[:, None])[:, 0]
+            # Mean error of every pair of orders, [24 joint orders, 24 foot orders].
+            total = torch.stack([cost[leg][_ORDERS[:, leg]][:, _ORDERS[:, leg]] for leg in range(4)]).mean(0).flatten()
+            first = int((total <= total.min() + _TIE).nonzero()[0])
+            if total[first] >= best_error - _TIE:
+                continue
+            best_error = float(total[first])
+            joint_blocks, foot_blocks = _ORDERS[first // len(_ORDERS)], _ORDERS[first % len(_ORDERS)]
+            legs = torch.arange(4)
+            signs = sign[legs, joint_blocks, foot_blocks]
+            best = Convention(
+                robot=robot,
+                joint_blocks=tuple(joint_blocks.tolist()),
+                hip_signs=tuple((1 - 2 * signs).tolist()),
+                foot_blocks=tuple(foot_blocks.tolist()),
+                foot_frame=frame,
+                error=float(mean[legs, signs, joint_blocks, foot_blocks].max()),
+                max_error=float(worst[legs, signs, joint_blocks, foot_blocks].max()),
+            )
+    assert best is not None, "no robots to try"
+    return best
 
 
 def read_sixty_one(path: str | Path, frame_duration: float, frames: Tensor) -> MotionClip:

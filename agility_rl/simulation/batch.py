@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from itertools import pairwise
 from typing import Any
 
 import mujoco
@@ -95,33 +96,47 @@ class BatchSimulator:
         self._read()
 
     def step(self, target: Tensor) -> None:
-        """Hold joint position targets ``[N, 12]`` [rad] for one control step."""
-        failed = None
-        try:
-            if self._delay_steps is None:
-                self._ctrl[:] = target.numpy()
-                self.batch.step(nstep=self.substeps)
-            else:
-                self._step_delayed(target)
-        except SimulationError as error:
-            failed = error.ids
+        """Hold joint position targets ``[N, 12]`` [rad] for one control step.
+
+        Raises:
+            ValueError: if ``target`` has another shape.
+        """
+        if tuple(target.shape) != (self.num_simulations, constants.NUM_JOINTS):
+            raise ValueError(
+                f"target must be [{self.num_simulations}, {constants.NUM_JOINTS}], got {list(target.shape)}"
+            )
+        failed: list[int] = []
+        if self._delay_steps is None:
+            self._ctrl[:] = target.numpy()
+            failed += self._advance(self.substeps)
+        else:
+            failed += self._step_delayed(target)
         self._previous_target = target.clone()
         count = self._warning_count()
         self.unstable = torch.from_numpy(count != self._warned)
         self._warned = count
         self._read()
-        if failed is not None:
-            self.unstable[torch.as_tensor(failed)] = True
+        self.unstable[failed] = True
 
-    def _step_delayed(self, target: Tensor) -> None:
+    def _advance(self, steps: int) -> list[int]:
+        """Physics steps for all; the simulations in which the engine raised (they keep their state, the rest go on)."""
+        try:
+            self.batch.step(nstep=steps)
+        except SimulationError as error:
+            return list(error.ids.tolist())
+        return []
+
+    def _step_delayed(self, target: Tensor) -> list[int]:
         """Step one physics step at a time; each simulation takes its new target after its own delay."""
         assert self._delay_steps is not None
         new, old = target.numpy(), self._previous_target.numpy()
         delay = self._delay_steps.numpy()
         edges = sorted({0, self.substeps, *np.unique(delay[delay < self.substeps]).tolist()})
-        for start, end in zip(edges[:-1], edges[1:], strict=True):
+        failed: list[int] = []
+        for start, end in pairwise(edges):
             self._ctrl[:] = np.where(delay[:, None] <= start, new, old)
-            self.batch.step(nstep=end - start)
+            failed += self._advance(end - start)
+        return failed
 
     def reset(
         self,
@@ -179,21 +194,26 @@ class BatchSimulator:
             self.batch.set_const(rows)
 
     def parameter(self, name: str) -> Tensor:
-        """Present value ``[N, size]`` of a parameter."""
-        if name in self._parameters:
-            return self._parameters[name]
+        """Present value ``[N, size]`` of a parameter, as a copy."""
+        return self._parameters[name].clone() if name in self._parameters else self._nominal(name)
+
+    def _nominal(self, name: str) -> Tensor:
+        """Value ``[N, size]`` of a parameter in the model as it was compiled."""
         model, size = self.model, PARAMETERS[name][0]
-        nominal = {
-            "stiffness": lambda: model.actuator_gainprm[:, 0],
-            "damping": lambda: -model.actuator_biasprm[:, 2],
-            "torque_limit": lambda: model.actuator_forcerange[:, 1],
-            "ground_friction": lambda: model.geom("floor").friction[:1],
-            "trunk_mass_offset": lambda: np.zeros(1),
-            "trunk_com_offset": lambda: np.zeros(3),
-            "action_delay": lambda: np.zeros(1),
-            **{key: (lambda f=field, s=part: getattr(model, f)[s]) for key, (field, part) in _FLAT.items()},
-        }[name]()
-        return torch.as_tensor(np.array(nominal), dtype=torch.float32).reshape(1, size).repeat(self.num_simulations, 1)
+        if name in _FLAT:
+            field, part = _FLAT[name]
+            value = getattr(model, field)[part]
+        elif name == "stiffness":
+            value = model.actuator_gainprm[:, 0]
+        elif name == "damping":
+            value = -model.actuator_biasprm[:, 2]
+        elif name == "torque_limit":
+            value = model.actuator_forcerange[:, 1]
+        elif name == "ground_friction":
+            value = model.geom("floor").friction[:1]
+        else:  # offsets and the delay
+            value = np.zeros(size)
+        return torch.as_tensor(np.array(value), dtype=torch.float32).reshape(1, size).repeat(self.num_simulations, 1)
 
     def _write(self, name: str, rows: np.ndarray, value: Tensor) -> None:
         batch, model = self.batch, self.model
@@ -265,7 +285,9 @@ class BatchSimulator:
                 "resume with the number of robots and the model that wrote it"
             )
         everyone = torch.ones(self.num_simulations, dtype=torch.bool)
-        self.set_parameters(everyone, **dict(state["parameters"]))
+        # What was never set in the saved simulation has its nominal value there, whatever it is here.
+        nominal = {name: self._nominal(name) for name in self._parameters}
+        self.set_parameters(everyone, **{**nominal, **state["parameters"]})
         self.batch.state[:] = saved
         self._warned = self._warning_count()
         self._read()

@@ -79,7 +79,7 @@ def test_gradients_go_where_the_paper_says() -> None:
     assert net.skill_head.weight.grad.abs().sum() > 0
     assert discriminator.trunk.layers[0].weight.grad.abs().sum() > 0
     assert discriminator.head.weight.grad is None
-    assert not any(losses[name].requires_grad for name in losses.keys() if not name.startswith("loss_"))
+    assert not any(value.requires_grad for name, value in losses.items() if not name.startswith("loss_"))
 
 
 def test_one_optimiser_step_on_both_losses_moves_the_shared_trunk_once() -> None:

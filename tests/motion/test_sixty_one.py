@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import torch
 
 from agility_rl import rotations
 from agility_rl.go2 import kinematics
-from agility_rl.motion import sixty_one
 from agility_rl.motion.clip import MotionClip, MotionError, central_difference
 from agility_rl.motion.legs import A1, GO2
 from agility_rl.motion.motion_json import read_frames
@@ -140,7 +138,3 @@ def test_a1_clips_are_found_to_be_of_an_a1(data: Path, file: str, frame: str, er
     clip = read_sixty_one(path, duration, frames)
     assert torch.allclose(clip.joint_position[:, :3], frames[:, 10:13].float())
     assert torch.allclose(clip.root_position, (frames[:, :3] * 0.426 / 0.4).float(), atol=1e-6)
-
-
-def test_all_orders_are_tried() -> None:
-    assert list(itertools.permutations(range(4))) == list(sixty_one._PERMUTATIONS)
