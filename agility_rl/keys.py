@@ -20,7 +20,7 @@ ESTIMATE = "estimate"
 """float32 ``[*B, 4]``, the state estimator's guess of :data:`EXPLICIT`."""
 
 PRIVILEGED = "privileged"
-"""float32 ``[*B, 29]``, trunk mass offset [kg], centre-of-mass offset 3 [m], friction, gain multipliers - 1 (12 + 12)."""
+"""float32 ``[*B, 29]``, trunk mass offset [kg], its centre offset 3 [m], friction, gain multipliers - 1 (12 + 12)."""
 
 HISTORY = "history"
 """float32 ``[*B, 10, P]``, the newest proprioceptions, oldest first, the present one included."""
@@ -54,4 +54,3 @@ SHIFT_ESTIMATE = "shift_estimate"
 
 REWARD_TERMS = "reward_terms"
 """nested: one float32 ``[*B, 1]`` per reward term, already multiplied by weight and time step."""
-

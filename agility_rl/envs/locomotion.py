@@ -102,6 +102,7 @@ class LocomotionEnv(EnvBase):
         seed: int = 0,
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([num_robots]))
+        self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
         self.simulator = simulator or make_simulator(num_simulations=num_robots, **(simulator_options or {}))
         if self.simulator.num_simulations != num_robots:
             raise ValueError(f"the simulator holds {self.simulator.num_simulations} robots, expected {num_robots}")
@@ -213,7 +214,7 @@ class LocomotionEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict[keys.ACTION]
         if self.push_steps is not None:
-            self._push()
+            self._push(self.push_steps)
         self.simulator.step(self._default_pose + self._action_scale * action)
         self._step_count = self._step_count + 1
         self._heights = torch.cat((self._heights[:, 1:], self._height()), -1)
@@ -268,8 +269,8 @@ class LocomotionEnv(EnvBase):
         self._stiffness = torch.where(row, fields["stiffness"], self._stiffness)
         self._damping = torch.where(row, fields["damping"], self._damping)
 
-    def _push(self) -> None:
-        mask = (self._step_count + self._push_phase) % self.push_steps == self.push_steps - 1  # type: ignore[operator]
+    def _push(self, interval: int) -> None:
+        mask = (self._step_count + self._push_phase) % interval == interval - 1
         if bool(mask.any()):
             velocity = self.push_velocity * (2.0 * torch.rand(self.num_robots, 2, generator=self.generator) - 1.0)
             self.simulator.push(mask, velocity)

@@ -1,4 +1,4 @@
-"""Reward terms of locomotion: plain functions of a :class:`LocomotionState`, each ``-> [N]``, without weight or time step.
+"""Reward terms of locomotion: functions of a :class:`LocomotionState`, each ``-> [N]``, without weight or time step.
 
 Sources: supplement S4 for the regularisation terms; the task terms are missing there and come from the released code
 (method notes, section 4.4). The environment multiplies each term by its weight and the control step, logs it by name,

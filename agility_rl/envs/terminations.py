@@ -20,7 +20,7 @@ def body_contact(state: LocomotionState) -> Tensor:
 
 
 def thigh_contact(state: LocomotionState) -> Tensor:
-    """A thigh presses on something with more than 1 N: a robot that sits has failed (stage 3's rule, method notes 5.6)."""
+    """A thigh presses on something with more than 1 N: sitting is a failure (stage 3's rule, method notes 5.6)."""
     return (state.thigh_contact > TERMINATION_FORCE).any(-1)
 
 

@@ -1,4 +1,4 @@
-"""Numbers that describe the robot's motion to networks: the one place where motion, environments and deployment get them.
+"""Numbers that describe the robot's motion to networks: the one place from which every part of the package gets them.
 
 The expert (a clip), the policy (a simulation) and the robot pass through the same functions, so they cannot disagree.
 

@@ -18,9 +18,7 @@ _SHANK = (constants.CALF**2 + constants.FOOT_OFFSET_X**2) ** 0.5
 
 def hip_positions(like: Tensor) -> Tensor:
     """Positions of the hip joints in the base frame [m], ``[4, 3]``, with the dtype and device of ``like``."""
-    rows = [
-        (constants.HIP_OFFSET_X * x, constants.HIP_OFFSET_Y * y, 0.0) for x, y in zip(_ALONG, _SIDE, strict=True)
-    ]
+    rows = [(constants.HIP_OFFSET_X * x, constants.HIP_OFFSET_Y * y, 0.0) for x, y in zip(_ALONG, _SIDE, strict=True)]
     return torch.tensor(rows, dtype=like.dtype, device=like.device)
 
 

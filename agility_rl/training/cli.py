@@ -5,22 +5,25 @@ A recipe owns a frozen dataclass and a dict of named instances; nothing in the p
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import importlib.metadata
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
+from torchrl.checkpoint import CheckpointError
 
 import agility_rl
 from agility_rl.training.checkpoint import publish
@@ -84,6 +87,48 @@ def from_presets(
     description = f"{doc or kind.__doc__ or ''}\n\nPresets: {names}; the defaults shown are those of {name!r}."
     program = f"{Path(sys.argv[0]).name} {name}"
     return tyro.cli(kind, args=arguments, default=presets[name], prog=program, description=description)
+
+
+@contextlib.contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Turn the errors that a user can mend into one line and status 2; defects keep their traceback.
+
+    Mendable are wrong values (``ValueError``, which motion and artifact errors are), files that are missing, present or
+    unreadable (``OSError``), and checkpoints that cannot be read.
+
+    Example:
+        >>> with contextlib.suppress(SystemExit), one_line_errors():
+        ...     raise ValueError("expected a folder")
+    """
+    try:
+        yield
+    except (ValueError, OSError, CheckpointError) as error:
+        _stop(" ".join(str(error).split()))
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C end a loop after its present iteration, so that what is saved then is exact; twice stops at once.
+
+    Example:
+        >>> with interruptible() as interrupted:
+        ...     interrupted()
+        False
+    """
+    requests = 0
+
+    def request(number: int, frame: types.FrameType | None) -> None:
+        nonlocal requests
+        requests += 1
+        if requests > 1:
+            raise KeyboardInterrupt
+        sys.stderr.write("stopping after this iteration; press Ctrl-C again to stop at once\n")
+
+    previous = signal.signal(signal.SIGINT, request)
+    try:
+        yield lambda: requests > 0
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 def start_run(config: Any, folder: str | Path, *, resume: bool = False, **extra: Any) -> Path:

@@ -66,11 +66,13 @@ class Display:
             self._live.update(self._table(iteration, metrics))
         elif (iteration - self._first) % self.lines_every == 1 or self.lines_every == 1 or iteration == self.total:
             shown = "  ".join(f"{name} {metrics[name]:.3g}" for name in self.headline if name in metrics)
-            self.console.print(f"{self.title} {iteration}/{self.total}  {shown}", highlight=False, soft_wrap=True)
+            self.console.print(
+                f"{self.title} {iteration}/{self.total}  {shown}", highlight=False, markup=False, soft_wrap=True
+            )
 
     def note(self, message: str) -> None:
         """Print a line above the display."""
-        self.console.print(message, highlight=False)
+        self.console.print(message, highlight=False, markup=False)
 
     def _table(self, iteration: int, metrics: Mapping[str, float]) -> Table:
         elapsed = time.monotonic() - self._start

@@ -46,6 +46,7 @@ class Rollout:
         self.value = value
         self.carrier: TensorDictBase | None = None
         self._storage: TensorDictBase | None = None
+        self._last_done: Tensor
 
     @torch.no_grad()
     def collect(self, policy: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:

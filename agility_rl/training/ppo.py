@@ -1,0 +1,107 @@
+"""The update of proximal policy optimisation that recipes share: epochs of minibatches, and a learning rate that
+follows the divergence of the policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.objectives import KLAdaptiveLR, LossModule
+
+Extra = Callable[[TensorDictBase], Tensor]
+
+
+class PPOUpdate:
+    """Descends a PPO loss over a collected batch.
+
+    Advantages are normalised over the whole batch. After each epoch the divergence between the policy that collected
+    and the present one, on the last minibatch, may change the learning rate.
+
+    Source: Schulman et al. 2017, arXiv:1707.06347; Table S1 (clip, learning rate); normalisation and adaptive rate:
+    released code (method notes, section 3.7).
+
+    Args:
+        loss: a loss that returns ``loss_objective``, ``loss_critic`` and ``loss_entropy``.
+        optimizer: optimiser of policy and critic.
+        epochs: passes over the batch.
+        minibatches: minibatches of a pass.
+        max_grad_norm: bound of the gradient's norm.
+        keep: entries of the batch beside the loss's own that ``extra`` or ``divergence`` read.
+        divergence: KL divergence [nat] of a minibatch, ``()``; ``None`` with a fixed learning rate.
+        schedule: adapts the learning rate to that divergence.
+
+    Raises:
+        ValueError: if the batch does not hold a sample for each minibatch (at the call).
+
+    Example:
+        See ``recipes/bbc_pretrain.py``; ``PPOUpdate(loss, optimizer, epochs=5, minibatches=4)`` is the least.
+
+        >>> PPOUpdate(torch.nn.Identity(), torch.optim.SGD([torch.zeros(1)]), epochs=5, minibatches=4).epochs
+        5
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        optimizer: torch.optim.Optimizer,
+        *,
+        epochs: int,
+        minibatches: int,
+        max_grad_norm: float = 1.0,
+        keep: Sequence[NestedKey] = (),
+        divergence: Extra | None = None,
+        schedule: KLAdaptiveLR | None = None,
+    ) -> None:
+        self.loss = loss
+        self.optimizer = optimizer
+        self.epochs = epochs
+        self.minibatches = minibatches
+        self.max_grad_norm = max_grad_norm
+        self.keep = tuple(keep)
+        self.divergence = divergence
+        self.schedule = schedule
+
+    def __call__(
+        self, batch: TensorDictBase, generator: torch.Generator, extra: Extra | None = None
+    ) -> dict[str, Tensor]:
+        """Update on a batch ``[T, N]`` that holds ``advantage`` and ``value_target``.
+
+        Args:
+            batch: collected experience with advantages.
+            generator: source of the minibatch order.
+            extra: another loss of a minibatch, added to PPO's.
+
+        Returns:
+            Metrics of the last minibatch, ``kl`` and ``learning_rate``.
+        """
+        advantage = batch["advantage"]
+        batch["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        names = dict.fromkeys((*self.loss.in_keys, "advantage", "value_target", *self.keep))
+        flat = batch.select(*(name for name in names if "next" not in name), strict=False).flatten()
+        size = flat.numel() // self.minibatches
+        if size < 1:
+            raise ValueError(f"expected at least {self.minibatches} samples, one a minibatch, got {flat.numel()}")
+        parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
+        metrics: dict[str, Tensor] = {}
+        for _ in range(self.epochs):
+            order = torch.randperm(flat.numel(), generator=generator)
+            for rows in order.split(size)[: self.minibatches]:
+                sample = flat[rows]
+                result = self.loss(sample)
+                loss = result["loss_objective"] + result["loss_critic"] + result["loss_entropy"]
+                if extra is not None:
+                    loss = loss + extra(sample)
+                self.optimizer.zero_grad(set_to_none=True)
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+                self.optimizer.step()
+            metrics = {name: value.detach() for name, value in result.items() if value.numel() == 1}
+            if self.divergence is not None:
+                with torch.no_grad():
+                    metrics["kl"] = self.divergence(sample)
+                if self.schedule is not None:
+                    self.schedule.step(metrics["kl"])
+        metrics["learning_rate"] = torch.tensor(self.optimizer.param_groups[0]["lr"])
+        return metrics

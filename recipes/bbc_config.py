@@ -1,0 +1,187 @@
+"""Options and presets of the recipes that train a Basic Behaviour Controller.
+
+``paper`` holds Table S1 and the supplement to the number, and the released code's values where those are silent;
+``cpu`` is tuned for two cores.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    labelled: Path | None = None
+    """Folder of clips named SKILL_N; synthetic gaits when not given."""
+    unlabelled: Path | None = None
+    """Folder of unlabelled clips."""
+    mirror: bool = True
+    """Add the left-right mirrored motion."""
+    standing_weight: float = 0.1
+    """Sampling weight of unlabelled frames in which the dog stands (1 = as recorded)."""
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    num_robots: int = 1024
+    terrain: Literal["flat", "rough"] = "flat"
+    """``flat`` or ``rough`` (method notes 4.5)."""
+    randomize: bool = True
+    push_interval: float | None = 8.0
+    """Seconds (released code)."""
+    observation_noise: float = 1.0
+    action_delay: float = 0.0
+    """Upper end of the random delay of actions [s]."""
+    jump_reward: Literal["peak", "window"] = "peak"
+    """``window`` as released, or ``peak``: the highest trunk of the last 0.9 s."""
+    jump_weight: float = 6.0
+    collision_weight: float = -10.0
+    """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
+    end_when_sitting: bool = False
+    """Contact of a thigh ends the episode too, as in stage 3."""
+    friction_loss: float = 0.2
+    """Dry friction of the joints [N m]; 0 as in the released simulation is a tenth faster."""
+    num_threads: int | None = None
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    steps: int = 24
+    epochs: int = 5
+    minibatches: int = 8
+    learning_rate: float = 1e-3
+    """Table S1."""
+    max_learning_rate: float = 1e-2
+    desired_kl: float | None = 0.01
+    """Released code; ``None`` keeps the learning rate."""
+    clip: float = 0.2
+    """Table S1."""
+    gamma: float = 0.99
+    """Table S1."""
+    lmbda: float = 0.95
+    """Table S1."""
+    entropy: float = 0.01
+    value: float = 1.0
+    max_grad_norm: float = 1.0
+    initial_std: float = 1.0
+    min_std: float = 0.1
+    hidden: tuple[int, ...] = (512, 256, 128)
+    """Supplement S6."""
+    critic_history: bool = True
+    """The critic reads the history too (released code)."""
+
+
+@dataclass(frozen=True)
+class ImitationConfig:
+    criterion: Literal["least_squares", "logistic", "wasserstein"] = "least_squares"
+    conditional: bool = False
+    """Tell the discriminator the skill (ours; the paper's does not know it)."""
+    labelled_share: float = 0.0
+    """Share of labelled motion in the discriminator's expert batch."""
+    minibatches: int = 80
+    batch_size: int = 1228
+    labelled_batch_size: int = 1228
+    replay: int = 1_000_000
+    """Policy frames kept (released code)."""
+    discriminator_learning_rate: float = 5e-4
+    """Table S1."""
+    encoder_learning_rate: float = 1e-3
+    """Table S1: class and shift heads."""
+    weight_decay: float = 1e-3
+    gradient_penalty: float = 0.1
+    information: float = 1.0
+    information_ramp: tuple[int, int] = (200, 10_000)
+    """First iteration and length of the ramp of the information-maximisation term (released code)."""
+    prior_weight: float = 1e-3
+    """Table S1: moving average weight, 1 - beta."""
+    prior_temperature: float | None = 0.25
+    """Skills are drawn from softmax(prior / temperature) (released code); ``None``: from the prior itself."""
+    imitation_reward: float = 0.2
+    """Table S1 (released code: 1.0)."""
+    skill_reward: float = 0.2
+    skill_floor: float | None = None
+    """Lift log Q^c to [0, 1] above this floor, so that no reward punishes being alive; ``None`` as published."""
+    shift_reward: float = 0.01
+    task_reward: float = 0.2
+    """Table S1."""
+    hidden: tuple[int, ...] = (512, 256)
+
+
+@dataclass(frozen=True)
+class AdaptationConfig:
+    learning_rate: float = 1e-4
+    every: int = 20
+    """Iterations between roll-outs that use the history encoder (released code)."""
+    minibatches: int = 8
+    privileged: float = 0.1
+    """Weight of pulling the privileged encoder towards the history encoder (released code)."""
+    privileged_ramp: tuple[int, int] = (1000, 2000)
+
+
+@dataclass(frozen=True)
+class Config:
+    name: str = "bbc"
+    """Folder under ``runs``."""
+    runs: Path = Path("runs")
+    seed: int = 0
+    iterations: int = 200_000
+    max_minutes: float | None = None
+    """Stop and save after this time."""
+    checkpoint_every: int = 50
+    resume: Path | None = None
+    """Run folder to go on with."""
+    init_from: Path | None = None
+    """Run or artifact folder whose policy to start from."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    env: EnvConfig = field(default_factory=EnvConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    imitation: ImitationConfig = field(default_factory=ImitationConfig)
+    adaptation: AdaptationConfig = field(default_factory=AdaptationConfig)
+
+
+PAPER = Config(
+    motion=MotionConfig(mirror=False, standing_weight=1.0),
+    env=EnvConfig(num_robots=4096, terrain="rough", action_delay=0.02, jump_reward="window", jump_weight=0.2),
+    ppo=PPOConfig(minibatches=4),
+)
+CPU = Config(
+    iterations=1000,
+    max_minutes=58.0,
+    env=EnvConfig(friction_loss=0.0, collision_weight=-2.0, end_when_sitting=True),
+    ppo=PPOConfig(
+        epochs=3, minibatches=6, max_learning_rate=2e-3, entropy=0.0005, initial_std=0.5, critic_history=False
+    ),
+    imitation=ImitationConfig(
+        conditional=True,
+        labelled_share=0.5,
+        minibatches=8,
+        batch_size=1024,
+        labelled_batch_size=512,
+        replay=400_000,
+        discriminator_learning_rate=3e-4,
+        encoder_learning_rate=3e-4,
+        gradient_penalty=5.0,
+        information=0.3,
+        information_ramp=(50, 300),
+        prior_weight=2e-3,
+        imitation_reward=1.0,
+        skill_floor=-4.0,
+    ),
+    adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
+)
+QUICKSTART = replace(CPU, name="quickstart", iterations=110, max_minutes=5.0, env=replace(CPU.env, num_robots=512))
+SMOKE = replace(
+    CPU,
+    name="smoke",
+    iterations=2,
+    checkpoint_every=1,
+    env=replace(CPU.env, num_robots=16),
+    ppo=replace(CPU.ppo, steps=8, epochs=1, minibatches=2, hidden=(32, 32)),
+    imitation=replace(
+        CPU.imitation, minibatches=2, batch_size=32, labelled_batch_size=32, replay=2048, hidden=(32, 32)
+    ),
+    adaptation=replace(CPU.adaptation, every=2),
+)
+PRESETS = {"smoke": SMOKE, "quickstart": QUICKSTART, "cpu": CPU, "paper": PAPER}

@@ -1,0 +1,234 @@
+"""What a run of stage 1 is made of: data, environment, networks, losses, optimisers, and the artifact it writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from bbc_config import Config, MotionConfig
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
+from torchrl.objectives.value import GAE
+
+from agility_rl import keys
+from agility_rl.behaviours import BEHAVIOURS
+from agility_rl.deploy.artifact import Artifact, build_manifest
+from agility_rl.envs import LocomotionEnv
+from agility_rl.envs.randomization import Randomization
+from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm, jump_height_peak, jump_height_window
+from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, thigh_contact
+from agility_rl.go2 import features
+from agility_rl.losses import AdaptationLoss, DiscriminatorLoss, PredictorLoss, StateEstimationLoss, functional
+from agility_rl.modules import (
+    BasicBehaviourController,
+    Critic,
+    Discriminator,
+    FeatureNormalizer,
+    Predictor,
+    SkillPrior,
+)
+from agility_rl.motion import MotionDataset, load_clips
+from agility_rl.motion.gaits import synthetic_dataset_clips
+from agility_rl.simulation import rough_pyramids
+from agility_rl.training.checkpoint import RunCheckpoint
+from agility_rl.training.ppo import PPOUpdate
+from agility_rl.training.rollout import Rollout
+from agility_rl.training.seeding import Seeds, seed_everything
+
+
+@dataclass
+class Components:
+    """Everything a run is made of."""
+
+    seeds: Seeds
+    dataset: MotionDataset
+    env: LocomotionEnv
+    bbc: BasicBehaviourController
+    critic: Critic
+    discriminator: Discriminator
+    predictor: Predictor
+    prior: SkillPrior
+    replay: TensorDictReplayBuffer
+    rollout: Rollout
+    advantage: GAE
+    discriminator_loss: DiscriminatorLoss
+    predictor_loss: PredictorLoss
+    adaptation_loss: AdaptationLoss
+    estimation_loss: StateEstimationLoss
+    policy_optimizer: torch.optim.Optimizer
+    imitation_optimizer: torch.optim.Optimizer
+    adaptation_optimizer: torch.optim.Optimizer
+    ppo: PPOUpdate
+
+    @property
+    def generator(self) -> torch.Generator:
+        """Source of minibatch order and motion samples."""
+        return self.seeds.generator("batches")
+
+    def checkpoint(self, folder: Path, progress: dict[str, float]) -> RunCheckpoint:
+        """All that a bit-exact continuation needs."""
+        names = ("seeds", "env", "bbc", "critic", "discriminator", "predictor", "prior", "replay", "rollout")
+        names += ("policy_optimizer", "imitation_optimizer", "adaptation_optimizer")
+        return RunCheckpoint(folder, progress=progress, **{name: getattr(self, name) for name in names})
+
+
+def build(cfg: Config) -> Components:
+    """Construct data, environment, networks, losses and optimisers."""
+    seeds, im, ppo = seed_everything(cfg.seed), cfg.imitation, cfg.ppo
+    dataset = load_motion(cfg.motion, cfg.seed)
+    terms = dict(LOCOMOTION_REWARDS)
+    jump = {"peak": jump_height_peak, "window": jump_height_window}[cfg.env.jump_reward]
+    terms["jump_height"] = RewardTerm(cfg.env.jump_weight, jump)
+    terms["collision"] = terms["collision"]._replace(weight=cfg.env.collision_weight)
+    skills = torch.arange(len(BEHAVIOURS)).repeat_interleave(2000)
+    reference = dataset.sample_states(skills, seeds.generator("reference"))
+    env = LocomotionEnv(
+        cfg.env.num_robots,
+        simulator_options={
+            "num_threads": cfg.env.num_threads,
+            "friction_loss": cfg.env.friction_loss,
+            "terrain": rough_pyramids(seeds.generator("terrain")) if cfg.env.terrain == "rough" else None,
+        },
+        reference=reference.set("skill", skills),
+        rewards=terms,
+        terminations=(*LOCOMOTION_TERMINATIONS, *([thigh_contact] if cfg.env.end_when_sitting else [])),
+        randomization=Randomization(action_delay=(0.0, cfg.env.action_delay)) if cfg.env.randomize else None,
+        observation_noise=cfg.env.observation_noise,
+        push_interval=cfg.env.push_interval,
+        seed=seeds.integer("environment"),
+    )
+    bbc = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std)
+    critic_keys = [keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.COMMAND, keys.PEAK]
+    critic_keys += [keys.HISTORY] if ppo.critic_history else []
+    width = sum(env.observation_spec[key].shape[1:].numel() for key in critic_keys)
+    critic = Critic(width, in_keys=critic_keys, hidden=ppo.hidden)
+    discriminator = Discriminator(
+        hidden=im.hidden,
+        normalizer=FeatureNormalizer(*dataset.statistics()),
+        num_skills=len(BEHAVIOURS) if im.conditional else None,
+    )
+    predictor = Predictor(trunk=discriminator.trunk)
+    adaptation_loss = AdaptationLoss(bbc.history_encoder, bbc.privileged_encoder)
+    heads = {"lr": im.encoder_learning_rate, "weight_decay": im.weight_decay}
+    policy_optimizer = torch.optim.Adam(
+        [*bbc.privileged_encoder.parameters(), *bbc.actor.parameters(), *critic.parameters()],
+        lr=ppo.learning_rate,
+        fused=True,
+    )
+    ppo_loss = ClipPPOLoss(
+        bbc.trained_actor(),
+        critic,
+        clip_epsilon=ppo.clip,
+        entropy_coeff=ppo.entropy,
+        critic_coeff=ppo.value,
+        loss_critic_type="l2",
+    )
+    schedule = None
+    if ppo.desired_kl is not None:
+        schedule = KLAdaptiveLR(policy_optimizer, ppo.desired_kl, max_lr=ppo.max_learning_rate)
+
+    def divergence(sample: TensorDictBase) -> Tensor:
+        bbc.actor.project_std()
+        now = bbc.actor[0](bbc.privileged_encoder(sample.exclude("loc", "scale")))
+        return functional.gaussian_kl(sample["loc"], sample["scale"], now["loc"], now["scale"]).mean()
+
+    rollout = Rollout(
+        env,
+        ppo.steps,
+        keep=[
+            *(
+                keys.PROPRIOCEPTION,
+                keys.EXPLICIT,
+                keys.ESTIMATE,
+                keys.PRIVILEGED,
+                keys.COMMAND,
+                keys.PEAK,
+                keys.HISTORY,
+            ),
+            *(keys.SKILL, keys.SHIFT, keys.ACTION, "action_log_prob", "loc", "scale"),
+        ],
+        keep_next=["reward", keys.MOTION, keys.REWARD_TERMS],
+        value=lambda observation: critic(observation.select(*critic_keys))["state_value"],
+    )
+    return Components(
+        seeds=seeds,
+        dataset=dataset,
+        env=env,
+        bbc=bbc,
+        critic=critic,
+        discriminator=discriminator,
+        predictor=predictor,
+        prior=SkillPrior(decay=1.0 - im.prior_weight, temperature=im.prior_temperature),
+        replay=TensorDictReplayBuffer(
+            storage=LazyTensorStorage(im.replay), batch_size=im.batch_size, generator=seeds.generator("replay")
+        ),
+        rollout=rollout,
+        advantage=GAE(gamma=ppo.gamma, lmbda=ppo.lmbda, value_network=None, time_dim=0),
+        ppo=PPOUpdate(
+            ppo_loss,
+            policy_optimizer,
+            epochs=ppo.epochs,
+            minibatches=ppo.minibatches,
+            max_grad_norm=ppo.max_grad_norm,
+            keep=["loc", "scale", keys.HISTORY],
+            divergence=divergence,
+            schedule=schedule,
+        ),
+        discriminator_loss=DiscriminatorLoss(
+            discriminator, criterion=im.criterion, gradient_penalty=im.gradient_penalty
+        ),
+        predictor_loss=PredictorLoss(predictor),
+        adaptation_loss=adaptation_loss,
+        estimation_loss=StateEstimationLoss(bbc.estimator),
+        policy_optimizer=policy_optimizer,
+        imitation_optimizer=torch.optim.Adam(
+            [
+                {"params": discriminator.parameters(), "lr": im.discriminator_learning_rate},
+                {"params": [*predictor.skill_head.parameters(), *predictor.shift_head.parameters()], **heads},
+            ],
+            weight_decay=im.weight_decay,
+            fused=True,
+        ),
+        adaptation_optimizer=torch.optim.Adam(
+            [*bbc.estimator.parameters(), *bbc.history_encoder.parameters()],
+            lr=cfg.adaptation.learning_rate,
+            fused=True,
+        ),
+    )
+
+
+def load_motion(cfg: MotionConfig, seed: int) -> MotionDataset:
+    """The clips of the given folders, or the synthetic gaits when there are none."""
+    if (cfg.labelled is None) != (cfg.unlabelled is None):
+        raise ValueError("give both --motion.labelled and --motion.unlabelled, or neither for synthetic gaits")
+    if cfg.labelled is None or cfg.unlabelled is None:
+        labelled, unlabelled = synthetic_dataset_clips(seed)
+    else:
+        labelled, unlabelled = load_clips(cfg.labelled, label="from name"), load_clips(cfg.unlabelled)
+    return MotionDataset(labelled, unlabelled, mirror=cfg.mirror, standing_weight=cfg.standing_weight)
+
+
+def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
+    """Write the controller as an artifact, with what is needed to run it elsewhere."""
+    synthetic = cfg.motion.labelled is None
+    manifest = build_manifest(
+        "bbc",
+        {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT},
+        control_period=parts.env.dt,
+        data=["synthetic gaits of agility_rl"]
+        if synthetic
+        else [
+            "/".join(folder.resolve().parts[-2:]) for folder in (cfg.motion.labelled, cfg.motion.unlabelled) if folder
+        ],
+    )
+    manifest["network"] = parts.bbc.settings
+    manifest["prior"] = parts.prior.probabilities.tolist()
+    Artifact.save(folder / "policy", parts.bbc.state_dict(), manifest)
+
+
+def policy_folder(path: Path) -> Path:
+    """The artifact in a run folder, or the folder itself."""
+    return path / "policy" if (path / "policy").is_dir() else path

@@ -1,0 +1,264 @@
+"""One HTML page of a run, with everything inside: targets, gaits, tracking, learning curves, settings.
+
+In:  a run folder of ``bbc_pretrain.py``, best after ``evaluate.py``, whose results and pictures the page shows.
+Out: ``RUN/report.html``, a single file that needs no network; an earlier one is replaced.
+
+    python recipes/report.py runs/my_run
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+from judgement import show
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from agility_rl.behaviours import BEHAVIOURS
+from agility_rl.record import read_scalars
+from agility_rl.record.plots import Curves, learning_curves
+from agility_rl.training.checkpoint import publish
+from agility_rl.training.cli import CONFIG_FILE
+
+STYLE = """
+:root { --ink: #1d2530; --faint: #6b7685; --line: #dde2e8; --good: #1a7f4b; --bad: #b3261e; --card: #f6f8fa; }
+body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); max-width: 1080px; margin: 2rem auto; padding: 0 1rem; }
+h1 { margin-bottom: 0; } h2 { margin-top: 2.5rem; border-bottom: 1px solid var(--line); padding-bottom: .2rem; }
+table { border-collapse: collapse; margin: .8rem 0; font-variant-numeric: tabular-nums; }
+th, td { padding: .25rem .7rem; border-bottom: 1px solid var(--line); text-align: right; }
+th:first-child, td:first-child { text-align: left; } th { font-weight: 600; }
+img { max-width: 100%; height: auto; } figure { margin: 1rem 0; } figcaption, .note { color: var(--faint); }
+.pass { color: var(--good); font-weight: 600; } .fail { color: var(--bad); font-weight: 600; }
+.headline { background: var(--card); padding: .8rem 1rem; border-radius: 6px; }
+.scroll { overflow-x: auto; } pre { background: var(--card); padding: 1rem; overflow-x: auto; font-size: 13px; }
+"""
+GROUPS = {
+    "Rewards": "reward/",
+    "Style of each behaviour": "style/",
+    "Behaviours recovered by the predictor": "recovery/",
+    "Task terms": "task/",
+    "Skill prior": "prior/",
+}
+SMOOTHING = 0.9
+
+
+@dataclass(frozen=True)
+class Config:
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+
+
+class Markup(str):
+    """Text that is HTML already; everything else in a table is escaped."""
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """An HTML table."""
+
+    def line(tag: str, cells: Sequence[Any]) -> str:
+        inner = (cell if isinstance(cell, Markup) else escape(str(cell)) for cell in cells)
+        return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in inner) + "</tr>"
+
+    body = "\n".join(line("td", row) for row in rows)
+    return f'<div class="scroll"><table>{line("th", header)}\n{body}</table></div>'
+
+
+def image(png: bytes, caption: str) -> str:
+    """A picture inside the page."""
+    text = escape(caption)
+    code = base64.b64encode(png).decode()
+    return f'<figure><img alt="{text}" src="data:image/png;base64,{code}"><figcaption>{text}</figcaption></figure>'
+
+
+def drawn(figure: Figure, caption: str) -> str:
+    """A matplotlib figure inside the page."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return image(buffer.getvalue(), caption)
+
+
+def note(text: str) -> str:
+    """A remark on what is missing."""
+    return f'<p class="note">{escape(text)}</p>'
+
+
+def interval(value: Mapping[str, Any] | None) -> str:
+    """An estimate with its interval."""
+    return show(None if value is None else [value["estimate"], value["low"], value["high"]])
+
+
+def read_json(path: Path) -> dict[str, Any] | None:
+    """A JSON file, or None where there is none.
+
+    Raises:
+        ValueError: if the file is damaged.
+    """
+    if not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}; make it again") from error
+
+
+def results(found: Mapping[str, Any], figures: Path) -> str:
+    """What ``evaluate.py`` measured."""
+    passed = sum(row["passed"] for row in found["targets"])
+    motion = found["motion"]["source"]
+    settings = found["settings"]
+    text = (
+        f"{settings['episodes']} episodes of {settings['seconds']:g} s of each behaviour, compared with {motion}. The "
+        "gait classifier that names what the robot showed knows nothing of the networks. Intervals are of 95 %."
+    )
+    summary = f"<b>{passed} of {len(found['targets'])} targets reached.</b> {escape(text)}"
+    parts = [f'<p class="headline">{summary}</p>']
+    verdicts = {True: Markup('<span class="pass">pass</span>'), False: Markup('<span class="fail">fail</span>')}
+    rows = [[r["name"], interval(r["value"]), r["target"], verdicts[r["passed"]]] for r in found["targets"]]
+    parts += ["<h2>Targets</h2>", table(["what", "measured", "target", ""], rows)]
+    parts += ["<h2>Commanded and shown</h2>", picture(figures / "behaviour_matrix.png", "shares of episodes")]
+    parts.append(drawn(tracking_scatter(found["episodes"]), "one point an episode; on the dashed line it did as told"))
+    names = found["episodes"]["quantities"]
+    errors = {name: entry["errors"] for name, entry in found["behaviours"].items()}
+    rows = [[name, *(interval(entry.get(key)) for key in names)] for name, entry in errors.items()]
+    parts += ["<h3>Mean errors of an episode</h3>", table(["commanded", *names], rows)]
+    parts.append("<h2>Robot and dog</h2>")
+    for name, entry in found["behaviours"].items():
+        rows = [
+            [
+                key,
+                interval(c["robot"]),
+                "{:.3f} to {:.3f}".format(*c["dog"]),
+                show([c["ratio_to_mean"]]),
+                verdicts[c["within"]],
+            ]
+            for key, c in entry["gait"].items()
+        ]
+        parts.append(f"<h3>{escape(name)}</h3>")
+        parts.append(
+            table(["", "robot", "dog's clips", "ratio to their mean", "within 25 %"], rows)
+            if rows
+            else note("no episode without a fall")
+        )
+        parts.append(picture(figures / f"footfall_{name}.png", f"{name}: feet on the ground"))
+        parts.append(picture(figures / f"tracking_{name}.png", f"{name}: one episode"))
+    if found.get("switches"):
+        safe, trials = found["switches"]["without_fall"], found["switches"]["trials"]
+        rows = [[a, *("" if a == b else f"{safe[f'{a} to {b}']} of {trials}" for b in BEHAVIOURS)] for a in BEHAVIOURS]
+        parts += ["<h2>Switches without a fall</h2>", table(["from / to", *BEHAVIOURS], rows)]
+    if found.get("prior"):
+        keys = ("learned", "unlabelled_among_behaviours")
+        rows = [[key.replace("_", " "), *(f"{found['prior'][key][name]:.2f}" for name in BEHAVIOURS)] for key in keys]
+        parts += ["<h2>Skill prior and unlabelled motion</h2>", table(["", *BEHAVIOURS], rows)]
+    return "\n".join(parts)
+
+
+def picture(path: Path, caption: str) -> str:
+    """A PNG of the run inside the page."""
+    return image(path.read_bytes(), caption) if path.is_file() else note(f"no picture {path.name}")
+
+
+def tracking_scatter(episodes: Mapping[str, Any]) -> Figure:
+    """Commanded against measured, one point an episode, one panel a quantity."""
+    skill = torch.tensor(episodes["skill"])
+    pairs = [torch.tensor([[or_nan(x) for x in row] for row in episodes[key]]) for key in ("commanded", "measured")]
+    figure = Figure(figsize=(12.0, 3.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    for column, name in enumerate(episodes["quantities"]):
+        axes = figure.add_subplot(1, len(episodes["quantities"]), column + 1)
+        wanted, got = (pair[:, column] for pair in pairs)
+        for index, behaviour in enumerate(BEHAVIOURS):
+            axes.scatter(wanted[skill == index], got[skill == index], s=7, alpha=0.6, label=behaviour)
+        ends = [float(wanted.min()), float(wanted.max())]
+        axes.plot(ends, ends, "k--", linewidth=1.0)
+        axes.set_title(name, fontsize=10)
+        axes.set_xlabel("commanded", fontsize=9)
+        axes.grid(alpha=0.3)
+        if column == 0:
+            axes.set_ylabel("measured", fontsize=9)
+            axes.legend(fontsize=8)
+    return figure
+
+
+def or_nan(value: float | None) -> float:
+    """What JSON had to write as null."""
+    return float("nan") if value is None else value
+
+
+def curves(run: Path) -> str:
+    """Learning curves of the run, group by group."""
+    if not (run / "metrics.mcap").is_file():
+        return note("no metrics.mcap in this folder: no learning curves")
+    scalars: Curves = read_scalars(run)
+    if not scalars:
+        return note("metrics.mcap holds no scalars yet")
+    groups = {title: [name for name in scalars if name.startswith(start)] for title, start in GROUPS.items()}
+    grouped = {name for names in groups.values() for name in names}
+    groups["Losses and the rest"] = [name for name in scalars if name not in grouped and not name.startswith("time/")]
+    groups["Time [s]"] = [name for name in scalars if name.startswith("time/")]
+    return "\n".join(
+        drawn(learning_curves({run.name: scalars}, sorted(names), smoothing=SMOOTHING, columns=4), title)
+        for title, names in groups.items()
+        if names
+    )
+
+
+def page(run: Path) -> str:
+    """The whole page.
+
+    Raises:
+        FileNotFoundError: if the folder is no run.
+    """
+    record, found = read_json(run / CONFIG_FILE), read_json(run / "evaluation.json")
+    manifest = read_json(run / "policy" / "manifest.json") or {}
+    if record is None and found is None:
+        raise FileNotFoundError(f"{run}: expected a run folder with {CONFIG_FILE} or evaluation.json; check the path")
+    record = record or {}
+    parts = [f"<h1>{escape(run.resolve().name)}</h1>"]
+    origin = [record.get("recipe"), record.get("started"), " ".join(record.get("command", []))]
+    parts.append(note(" · ".join(str(entry) for entry in origin if entry)))
+    parts.append(results(found, run / "figures") if found else note("not evaluated yet: run recipes/evaluate.py on it"))
+    strips = sorted((run / "figures").glob("play_*.png"))
+    if strips:
+        parts += ["<h2>Pictures</h2>", *(picture(strip, strip.stem.removeprefix("play_")) for strip in strips)]
+    parts += ["<h2>Learning</h2>", curves(run)]
+    parts.append("<h2>What it was made of</h2>")
+    if data := manifest.get("data"):
+        parts.append(f"<p>Motion: {escape(', '.join(data))}</p>")
+    parts.append(table(["package", "version"], sorted(record.get("versions", {}).items())))
+    for title, value in (("Configuration", record.get("config")), ("Manifest of the policy", manifest)):
+        if value:
+            text = escape(json.dumps(value, indent=2))
+            parts.append(f"<details><summary>{title}</summary><pre>{text}</pre></details>")
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(run.name)}</title>'
+    body = "\n".join(parts)
+    return f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head><body>\n{body}\n</body></html>\n'
+
+
+def main(config: Config) -> Path:
+    """Write the page in one step and return its path."""
+    target = config.run / "report.html"
+    text = page(config.run)
+    staged = target.with_name(f".{target.name}.incoming")
+    staged.write_text(text, encoding="utf-8")
+    publish(staged, target)
+    return target
+
+
+if __name__ == "__main__":
+    screen = Console()
+    try:
+        screen.print(main(tyro.cli(Config, description=__doc__)).as_posix(), soft_wrap=True, highlight=False)
+    except (ValueError, OSError) as error:
+        screen.print(f"[red]error[/] {error}", soft_wrap=True, highlight=False)
+        sys.exit(2)

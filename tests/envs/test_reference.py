@@ -1,0 +1,103 @@
+"""Reference states: drawn by skill, and put into the engine in the right frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from agility_rl import keys
+from agility_rl.envs import LocomotionEnv
+from agility_rl.envs.locomotion import CLEARANCE
+from agility_rl.envs.reference import STATE_ENTRIES, ReferenceStates
+from agility_rl.go2.constants import DEFAULT_POSE
+
+
+def states(skills: list[int]) -> TensorDict:
+    """States that differ in everything; ``root_height`` is their number."""
+    n, generator = len(skills), torch.Generator().manual_seed(1)
+    return TensorDict(
+        {
+            "skill": torch.tensor(skills),
+            "root_height": torch.arange(float(n))[:, None],
+            "root_quaternion": torch.nn.functional.normalize(torch.randn(n, 4, generator=generator), dim=-1),
+            "root_linear_velocity": torch.randn(n, 3, generator=generator),
+            "root_angular_velocity": torch.randn(n, 3, generator=generator),
+            "joint_position": torch.tensor(DEFAULT_POSE) + 0.1 * torch.randn(n, 12, generator=generator),
+            "joint_velocity": torch.randn(n, 12, generator=generator),
+        },
+        [n],
+    )
+
+
+def test_each_skill_draws_only_its_own_states(generator: torch.Generator) -> None:
+    skills = [3, 0, 1, 4, 2, 0, 3, 3]
+    reference = ReferenceStates(states(skills))
+    for skill in range(5):
+        drawn = reference.sample(torch.full((600,), skill), generator)
+        numbers = torch.bincount(drawn["root_height"][:, 0].long(), minlength=8)
+        own = [i for i, s in enumerate(skills) if s == skill]
+        assert numbers.nonzero()[:, 0].tolist() == own
+        assert (numbers[own] - 600 / len(own)).abs().max() <= 60
+
+
+def test_entries_of_a_state_stay_together(generator: torch.Generator) -> None:
+    given = states([3, 0, 1, 4, 2, 0])
+    drawn = ReferenceStates(given).sample(torch.tensor([0, 1, 2, 3, 4, 0]), generator)
+    for row in drawn:
+        original = given[int(row["root_height"])]
+        assert all(torch.equal(row[name], original[name]) for name in STATE_ENTRIES)
+
+
+def test_draws_follow_the_generator() -> None:
+    reference = ReferenceStates(states([0, 1, 2, 3, 4] * 20))
+    skill = torch.zeros(50, dtype=torch.int64)
+    one, other = (reference.sample(skill, torch.Generator().manual_seed(7))["root_height"] for _ in range(2))
+    assert torch.equal(one, other)
+
+
+def test_standing_states_stand() -> None:
+    state = ReferenceStates.standing().states
+    assert state["joint_position"].unique(dim=0).tolist() == torch.tensor([DEFAULT_POSE]).tolist()
+    assert not state["joint_velocity"].any() and not state["root_linear_velocity"].any()
+    # soles on the ground: thigh and calf of 0.213 m at 0.9 rad each, foot radius 0.022 m, foot offset -0.002 m
+    sole = 2 * 0.213 * np.cos(0.9) + 0.022
+    assert state["root_height"][0].item() == pytest.approx(sole, abs=2.5e-3)
+
+
+def test_errors_name_what_is_missing() -> None:
+    with pytest.raises(ValueError, match="lack joint_velocity, root_height; they have"):
+        ReferenceStates(states([0, 1, 2, 3, 4]).exclude("root_height", "joint_velocity"))
+    with pytest.raises(ValueError, match="no reference state for pace, jump"):
+        ReferenceStates(states([0, 2, 3]))
+
+
+def test_resets_turn_a_state_about_the_vertical_only(build: Callable[..., LocomotionEnv]) -> None:
+    given = states([0, 1, 2, 3, 4])
+    given["root_height"] = 0.5 + 0.1 * given["root_height"]
+    env = build(40, reference=given)
+    observation = env.reset()
+    simulator = env.simulator
+    source = given[observation[keys.SKILL]]
+    torch.testing.assert_close(simulator.root_position[:, 2:], source["root_height"] + CLEARANCE)
+    assert torch.equal(simulator.joint_position, source["joint_position"])
+    assert torch.equal(simulator.joint_velocity, source["joint_velocity"])
+    yaws = []
+    for row in range(40):
+        before, after, velocity = np.zeros(9), np.zeros(9), np.zeros(3)
+        mujoco.mju_quat2Mat(before, source["root_quaternion"][row].double().numpy())
+        mujoco.mju_quat2Mat(after, simulator.root_quaternion[row].double().numpy())
+        before, after = before.reshape(3, 3), after.reshape(3, 3)
+        turn = after @ before.T
+        np.testing.assert_allclose(turn[2], [0, 0, 1], atol=1e-5)  # a pure yaw
+        yaws.append(np.arctan2(turn[1, 0], turn[0, 0]))
+        velocity = source["root_linear_velocity"][row].double().numpy()
+        np.testing.assert_allclose(simulator.root_linear_velocity[row].numpy(), turn @ velocity, atol=1e-5)
+        # the engine keeps the angular velocity in the base frame, where a yaw changes nothing
+        spin = before.T @ source["root_angular_velocity"][row].double().numpy()
+        np.testing.assert_allclose(simulator.root_angular_velocity[row].numpy(), spin, atol=1e-5)
+    assert np.ptp(yaws) > np.pi

@@ -1,0 +1,50 @@
+"""A tiny run: the artifact of an untrained controller."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from agility_rl.deploy.artifact import Artifact, build_manifest
+from agility_rl.go2 import features
+from agility_rl.modules import BasicBehaviourController
+
+
+@pytest.fixture
+def untrained(tmp_path: Path) -> Path:
+    """Run folder with ``policy/`` and nothing else."""
+    bbc = BasicBehaviourController(hidden=(16, 16))
+    layouts = {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT}
+    manifest = build_manifest("bbc", layouts, control_period=0.02)
+    manifest |= {"network": bbc.settings, "prior": [0.6, 0.2, 0.1, 0.06, 0.04]}
+    Artifact.save(tmp_path / "run" / "policy", bbc.state_dict(), manifest)
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def recipe(repository: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run a recipe as a user does: ``recipe("evaluate", "runs/x", "--episodes", 2)``."""
+
+    def run(name: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+        variables = os.environ | {"PYTHONPATH": str(repository), "OMP_NUM_THREADS": "1"} | environment
+        command = [sys.executable, f"recipes/{name}.py", *(str(argument) for argument in arguments)]
+        return subprocess.run(command, cwd=repository, env=variables, capture_output=True, text=True, timeout=300)
+
+    return run
+
+
+@pytest.fixture
+def module(repository: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], ModuleType]]:
+    """Import a recipe with what it imports from beside it, as running it by path does."""
+    folder = repository / "recipes"
+    monkeypatch.syspath_prepend(str(folder))
+    yield importlib.import_module
+    for path in folder.glob("*.py"):
+        sys.modules.pop(path.stem, None)

@@ -1,0 +1,97 @@
+"""The recipe of stage 1, run as a user would, on a few robots and the synthetic gaits."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from agility_rl.deploy.artifact import Artifact
+from agility_rl.record.mcap_logger import read_scalars
+from agility_rl.training.checkpoint import RunCheckpoint
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "bbc_pretrain.py"
+
+
+def run(folder: Path, *options: str, check: bool = True) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(RECIPE), "smoke", "--runs", str(folder), *options]
+    return subprocess.run(command, capture_output=True, text=True, check=check, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four iterations without interruption."""
+    folder = tmp_path_factory.mktemp("runs")
+    run(folder, "--name", "whole", "--iterations", "4")
+    return folder
+
+
+def test_smoke_run_writes_everything_the_next_stage_needs(finished: Path) -> None:
+    whole = finished / "whole"
+    artifact = Artifact.load(whole / "policy", kind="bbc")
+    assert artifact.manifest["control_period"] == 0.02
+    assert artifact.manifest["data"] == ["synthetic gaits of agility_rl"]
+    assert sum(artifact.manifest["prior"]) == pytest.approx(1.0)
+    record = json.loads((whole / "config.json").read_text())
+    assert record["config"]["seed"] == 0 and "torchrl" in record["versions"]
+    scalars = read_scalars(whole)
+    for name in ("reward/imitation", "reward/task", "accuracy_expert", "recovery/trot", "prior/walk"):
+        assert scalars[name][0].tolist() == [1, 2, 3, 4]
+    assert bool(scalars["loss_critic"][1].isfinite().all())
+
+
+def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished: Path) -> None:
+    run(finished, "--name", "halves", "--iterations", "2")
+    run(finished, "--resume", str(finished / "halves"), "--iterations", "4")
+    whole, halves = (Artifact.load(finished / name / "policy").state for name in ("whole", "halves"))
+    assert whole.keys() == halves.keys()
+    different = [name for name, tensor in whole.items() if not torch.equal(tensor, halves[name])]
+    assert not different
+    for name in ("reward/imitation", "loss_critic", "loss_discriminator", "prior/jump"):
+        expected, got = (read_scalars(finished / run_name)[name][1] for run_name in ("whole", "halves"))
+        assert torch.equal(expected, got), name
+
+
+def test_init_from_starts_with_the_given_policy(finished: Path) -> None:
+    run(finished, "--name", "child", "--iterations", "1", "--init-from", str(finished / "whole"))
+    assert Artifact.load(finished / "child" / "policy").manifest["network"]["hidden"] == [32, 32]
+
+
+def test_a_run_is_never_overwritten(finished: Path) -> None:
+    before = (finished / "whole" / "config.json").read_bytes()
+    result = run(finished, "--name", "whole", check=False)
+    assert result.returncode != 0
+    assert "already holds a run" in result.stderr and "Traceback" not in result.stderr
+    assert (finished / "whole" / "config.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--ppo.epoks", "3"), "did you mean --ppo.epochs"),
+        (("--motion.labelled", "nowhere", "--motion.unlabelled", "nowhere"), "nowhere"),
+        (("--motion.labelled", "nowhere"), "give both"),
+        (("--env.terrain", "lava"), "flat"),
+        (("--resume", "nowhere"), "nothing to resume"),
+    ],
+)
+def test_bad_options_give_one_clear_line(tmp_path: Path, options: tuple[str, ...], message: str) -> None:
+    result = run(tmp_path, *options, check=False)
+    assert result.returncode == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_truncated_checkpoint_is_refused_and_left_alone(finished: Path, tmp_path: Path) -> None:
+    run(tmp_path, "--name", "broken", "--iterations", "1")
+    newest = sorted((tmp_path / "broken" / "checkpoints").glob("*.torchrl"))[-1]
+    newest.write_bytes(newest.read_bytes()[:1000])
+    result = run(tmp_path, "--resume", str(tmp_path / "broken"), check=False)
+    assert result.returncode == 2
+    assert "damaged" in result.stderr and "Traceback" not in result.stderr
+    assert newest.stat().st_size == 1000
+    assert RunCheckpoint(newest.parent, counters={}).steps() == (1,)

@@ -1,0 +1,42 @@
+"""The page of a run that is not evaluated yet, and of a folder that is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from agility_rl.record import MCAPLogger
+from agility_rl.training.cli import start_run
+
+
+@dataclass(frozen=True)
+class Config:
+    name: str = "<b>bold</b>"
+
+
+def test_a_run_without_evaluation_shows_its_learning_curves(tmp_path: Path, module) -> None:
+    run = start_run(Config(), tmp_path / "young", recipe="bbc_pretrain")
+    logger = MCAPLogger(run.name, run.parent)
+    for step in range(3):
+        logger.log_metrics({"reward/task": float(step), "kl": 0.01}, step=step)
+    logger.close()
+    report = module("report")
+    report.main(report.Config(run))
+    text = (run / "report.html").read_text()
+    assert "not evaluated yet" in text and text.count("data:image/png;base64,") == 2
+    assert "<b>bold</b>" not in text, "what a run contains is text, never markup"
+
+
+def test_a_folder_that_is_no_run(tmp_path: Path, module) -> None:
+    report = module("report")
+    with pytest.raises(FileNotFoundError, match="expected a run folder"):
+        report.main(report.Config(tmp_path))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_damaged_evaluation_is_named(tmp_path: Path, recipe) -> None:
+    (tmp_path / "evaluation.json").write_text("{")
+    result = recipe("report", tmp_path)
+    assert result.returncode == 2 and "evaluation.json is damaged" in result.stdout

@@ -1,0 +1,73 @@
+"""The shared PPO update, on a problem small enough to solve."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
+
+from agility_rl.modules import Critic, GaussianActor
+from agility_rl.training.ppo import PPOUpdate
+
+
+def build(**options: object) -> tuple[GaussianActor, Critic, PPOUpdate]:
+    torch.manual_seed(0)
+    actor = GaussianActor(2, 1, in_keys=["observation"], hidden=(16,), initial_std=0.5)
+    critic = Critic(2, in_keys=["observation"], hidden=(16,))
+    optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=3e-3)
+    loss = ClipPPOLoss(actor, critic, entropy_coeff=0.0, loss_critic_type="l2")
+    settings = {"epochs": 4, "minibatches": 2, **options}
+    return actor, critic, PPOUpdate(loss, optimizer, **settings)  # type: ignore[arg-type]
+
+
+def collect(actor: GaussianActor, critic: Critic, generator: torch.Generator) -> TensorDict:
+    """One-step episodes whose reward is highest at action = first observation."""
+    batch = TensorDict({"observation": torch.rand(8, 16, 2, generator=generator)}, [8, 16])
+    with torch.no_grad():
+        critic(actor(batch))
+    reward = -(batch["action"] - batch["observation"][..., :1]).square()
+    batch["advantage"], batch["value_target"] = reward - batch["state_value"], reward
+    return batch
+
+
+def test_it_learns_the_action_that_pays() -> None:
+    actor, critic, update = build()
+    generator = torch.Generator().manual_seed(1)
+    returns = []
+    for _ in range(60):
+        batch = collect(actor, critic, generator)
+        returns.append(batch["value_target"].mean().item())
+        metrics = update(batch, generator)
+    assert sum(returns[-5:]) / 5 > 0.4 * sum(returns[:5]) / 5  # rewards are negative: less than half of the first cost
+    assert {"loss_objective", "loss_critic", "learning_rate"} <= metrics.keys()
+
+
+def test_advantages_are_normalised_over_the_batch() -> None:
+    actor, critic, update = build()
+    batch = collect(actor, critic, torch.Generator().manual_seed(1))
+    update(batch, torch.Generator().manual_seed(2))
+    assert batch["advantage"].mean().item() == pytest.approx(0.0, abs=1e-5)
+    assert batch["advantage"].std().item() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_the_divergence_moves_the_learning_rate() -> None:
+    actor, critic, update = build(divergence=lambda sample: torch.tensor(1.0))
+    update.schedule = KLAdaptiveLR(update.optimizer, 0.01)
+    metrics = update(collect(actor, critic, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(2))
+    assert metrics["learning_rate"].item() == pytest.approx(3e-3 / 1.5**4)
+    assert metrics["kl"].item() == 1.0
+
+
+def test_an_extra_loss_is_added() -> None:
+    actor, critic, update = build(epochs=1, minibatches=1)
+    before = actor.network.std.detach().clone()
+    batch = collect(actor, critic, torch.Generator().manual_seed(1))
+    update(batch, torch.Generator().manual_seed(2), extra=lambda sample: 1e3 * actor.network.std.sum())
+    assert bool((actor.network.std < before).all())
+
+
+def test_too_few_samples_are_refused() -> None:
+    actor, critic, update = build(minibatches=1000)
+    with pytest.raises(ValueError, match="at least 1000 samples"):
+        update(collect(actor, critic, torch.Generator().manual_seed(1)), torch.Generator())
