@@ -51,7 +51,7 @@ def visible_model(skin: Path | None) -> mujoco.MjModel:
     if skin is None:
         for geom in spec.geoms:
             geom.group = 0
-            if "foot" in geom.name or geom.name.endswith(("calf", "shank")):
+            if geom.name.endswith(("foot", "calf", "shin")):
                 geom.rgba = [0.15, 0.15, 0.17, 1.0]
     spec.visual.headlight.ambient = [0.45, 0.45, 0.45]
     spec.add_texture(
@@ -81,7 +81,7 @@ def main(config: Config) -> None:
     pieces = rows_of(metadata, len(pose[0]))
     model = visible_model(config.skin)
     data, camera = mujoco.MjData(model), mujoco.MjvCamera()
-    camera.distance, camera.elevation = 1.3, -12.0
+    camera.distance, camera.elevation = 1.1, -12.0
     figure = Figure(figsize=(1.6 * config.frames, 1.35 * len(pieces)), layout="constrained")
     FigureCanvasAgg(figure)
     with mujoco.Renderer(model, config.height, config.width) as renderer:

@@ -40,6 +40,12 @@ class Simulator(Protocol):
         joint_velocity: ``[N, 12]`` [rad/s].
         contact_force: ``[N, 17]`` [N], net force on each group of :data:`agility_rl.go2.constants.CONTACT_GROUPS`.
         unstable: bool ``[N]``, the engine reported divergence in the last step.
+
+    Example:
+        >>> simulator: Simulator = make_simulator(num_simulations=1, num_threads=1)
+        >>> simulator.step(simulator.joint_position)
+        >>> simulator.unstable
+        tensor([False])
     """
 
     num_simulations: int

@@ -178,6 +178,8 @@ def read_config(folder: str | Path, kind: type[C]) -> C:
         ValueError: if the file is damaged, or has fields that the dataclass does not know.
     """
     path = Path(folder) / CONFIG_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"nothing to resume: {path} does not exist; expected the folder of a run")
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         values, version = record["config"], record["config_version"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -83,13 +84,14 @@ class Rollout:
         self._storage["next", "state_value"][-1] += final.masked_fill(self._last_done, 0.0)
         return self._storage
 
-    def state_dict(self) -> dict[str, TensorDictBase]:
-        """The observations from which the next call goes on."""
-        return {} if self.carrier is None else {"carrier": self.carrier.clone()}
+    def state_dict(self) -> dict[str, Any]:
+        """The observations from which the next call goes on, as nested dicts of tensors."""
+        return {} if self.carrier is None else {"carrier": self.carrier.clone().to_dict()}
 
-    def load_state_dict(self, state: dict[str, TensorDictBase]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self.carrier = state.get("carrier")
+        carrier = state.get("carrier")
+        self.carrier = None if carrier is None else TensorDict(carrier, self.env.batch_size)
 
 
 def _allocate(row: TensorDictBase, num_steps: int) -> TensorDictBase:

@@ -91,6 +91,34 @@ def test_stance_share_is_the_planned_duty_of_synthetic_gaits(name: str, evaluate
     assert share == pytest.approx(float(clip.foot_contact.float().mean()), abs=0.09)
 
 
+def test_gaits_of_robots_are_named_and_a_fall_is_no_gait(evaluate: ModuleType) -> None:
+    clips = [synthesize_gait(name, duration=4.0) for name in (*BEHAVIOURS, "trot")]
+    heading = [rotations.heading(clip.root_quaternion) for clip in clips]
+    recording = evaluate.Recording(
+        feet=torch.stack(
+            [
+                rotations.rotate_inverse(turn[:, None], clip.foot_position - clip.root_position[:, None])
+                for turn, clip in zip(heading, clips, strict=True)
+            ]
+        ),
+        sole=torch.stack([clip.foot_contact for clip in clips]),
+        pressed=torch.stack([clip.foot_contact for clip in clips]),
+        height=torch.stack([clip.root_position[:, 2] for clip in clips]),
+        velocity=torch.stack(
+            [
+                rotations.rotate_inverse(turn, clip.root_linear_velocity)
+                for turn, clip in zip(heading, clips, strict=True)
+            ]
+        ),
+        yaw_rate=torch.stack([clip.root_angular_velocity[:, 2] for clip in clips]),
+        fell=torch.tensor([False] * 5 + [True]),
+    )
+    shown, figures = evaluate.name_gaits(recording, start=25)
+    assert [evaluate.COLUMNS[index] for index in shown] == [*BEHAVIOURS, "fall"]
+    assert figures["phase FL-FR"][2] == pytest.approx(0.5, abs=0.03)
+    assert figures["stride frequency"].isnan().tolist() == [False] * 5 + [True]
+
+
 def test_comparison_with_the_dog_by_hand(evaluate: ModuleType) -> None:
     def within(value: float, dog: list[float], slack: float = 0.0) -> bool:
         return evaluate.compare(Interval(value, value, value), dog, slack)["within"]
