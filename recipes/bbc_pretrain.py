@@ -75,6 +75,8 @@ def expert_batch(
 ) -> TensorDictBase:
     """Expert motion for the discriminator: unlabelled, with a share of labelled motion in the policy's own skills."""
     count = round(cfg.labelled_share * cfg.batch_size)
+    if count == 0 and not cfg.conditional:
+        return unlabelled
     shares = torch.bincount(policy[keys.SKILL], minlength=len(BEHAVIOURS)).float()
     labelled = parts.dataset.sample_labelled(count, parts.generator, shares / shares.sum())
     rest = unlabelled[: cfg.batch_size - count].clone(recurse=False)

@@ -105,9 +105,12 @@ def build(cfg: Config) -> Components:
     critic_keys += [keys.HISTORY] if ppo.critic_history else []
     width = sum(env.observation_spec[key].shape[1:].numel() for key in critic_keys)
     critic = Critic(width, in_keys=critic_keys, hidden=ppo.hidden)
+    mean, deviation = dataset.statistics()
+    height = features.layout_slice(features.MOTION_LAYOUT, "root_height")
+    deviation[height].clamp_(min=im.height_deviation)
     discriminator = Discriminator(
         hidden=im.hidden,
-        normalizer=FeatureNormalizer(*dataset.statistics()),
+        normalizer=FeatureNormalizer(mean, deviation),
         num_skills=len(BEHAVIOURS) if im.conditional else None,
     )
     predictor = Predictor(trunk=discriminator.trunk)
