@@ -187,12 +187,12 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     lap("imitation")
     metrics |= add_rewards(parts, cfg.imitation, batch, parts.env.dt)
     weight = functional.linear_ramp(iteration, *cfg.adaptation.privileged_ramp, cfg.adaptation.privileged)
+    parts.adaptation_loss.privileged = weight  # the loss applies its own coefficient
     if not with_history:
         with torch.no_grad():
             parts.advantage(batch)
-        metrics |= parts.ppo(
-            batch, parts.generator, lambda sample: weight * parts.adaptation_loss(sample)["loss_privileged"]
-        )
+        extra = (lambda sample: parts.adaptation_loss(sample)["loss_privileged"]) if weight > 0.0 else None
+        metrics |= parts.ppo(batch, parts.generator, extra)
     lap("policy")
     metrics |= update_adaptation(parts, cfg.adaptation.minibatches, batch)
     lap("adaptation")
