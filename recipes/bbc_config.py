@@ -33,12 +33,18 @@ class EnvConfig:
     """Seconds (released code)."""
     observation_noise: float = 1.0
     action_delay: float = 0.0
-    """Upper end of the random delay of actions [s]."""
+    """Delay of every action [s]."""
+    action_delay_from: int = 0
+    """Iteration at which the delay begins, robot by robot with its next episode."""
     jump_reward: Literal["peak", "window"] = "peak"
     """``window`` as released, or ``peak``: the highest trunk of the last 0.9 s."""
     jump_weight: float = 6.0
+    progress_weight: float = 0.0
+    """Weight of a reward for the share of the commanded velocity reached (ours); it pays nothing for standing."""
     collision_weight: float = -10.0
     """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
+    episode_length: float = 20.0
+    """Seconds until an episode is cut; shorter ones start more often in the middle of a dog's motion."""
     end_when_sitting: bool = False
     """Contact of a thigh ends the episode too, as in stage 3."""
     friction_loss: float = 0.2
@@ -91,6 +97,10 @@ class ImitationConfig:
     """Table S1: class and shift heads."""
     weight_decay: float = 1e-3
     gradient_penalty: float = 0.1
+    cloning: int = 0
+    """Steps in which the actor copies the labelled clips before anything else."""
+    warm_up: int = 0
+    """Steps in which the predictor learns the labels before anything else, so that its first rewards mean something."""
     information: float = 1.0
     information_ramp: tuple[int, int] = (200, 10_000)
     """First iteration and length of the ramp of the information-maximisation term (released code)."""
@@ -146,7 +156,14 @@ class Config:
 
 PAPER = Config(
     motion=MotionConfig(mirror=False, standing_weight=1.0),
-    env=EnvConfig(num_robots=4096, terrain="rough", action_delay=0.02, jump_reward="window", jump_weight=0.2),
+    env=EnvConfig(
+        num_robots=4096,
+        terrain="rough",
+        action_delay=0.02,
+        action_delay_from=20_000,
+        jump_reward="window",
+        jump_weight=0.2,
+    ),
     ppo=PPOConfig(minibatches=4),
 )
 CPU = Config(
@@ -158,6 +175,8 @@ CPU = Config(
         observation_noise=0.0,
         friction_loss=0.0,
         collision_weight=-2.0,
+        episode_length=8.0,
+        progress_weight=4.0,
         end_when_sitting=True,
     ),
     ppo=PPOConfig(
@@ -179,6 +198,8 @@ CPU = Config(
         discriminator_learning_rate=1e-4,
         encoder_learning_rate=3e-4,
         gradient_penalty=50.0,
+        cloning=3000,
+        warm_up=300,
         information=0.3,
         information_ramp=(50, 300),
         prior_weight=2e-3,

@@ -19,6 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from bbc_cloning import clone_behaviour
 from bbc_config import PRESETS, Config, ImitationConfig
 from bbc_setup import Components, build, policy_folder, save_policy
 from tensordict import TensorDict, TensorDictBase
@@ -67,6 +68,18 @@ def update_imitation(parts: Components, cfg: ImitationConfig, iteration: int) ->
             if value.numel() == 1:
                 totals[name] = totals.get(name, torch.zeros(())) + value.detach() / cfg.minibatches
     return totals
+
+
+def warm_up_predictor(parts: Components, cfg: ImitationConfig) -> None:
+    """Teach Q^c the labels; the shared trunk then already tells the behaviours apart."""
+    network = parts.predictor
+    optimizer = torch.optim.Adam(network.parameters(), lr=cfg.encoder_learning_rate, weight_decay=cfg.weight_decay)
+    for _ in range(cfg.warm_up):
+        labelled = parts.dataset.sample_labelled(cfg.labelled_batch_size, parts.generator)
+        loss = torch.nn.functional.cross_entropy(network(labelled)[keys.SKILL_LOGITS], labelled[keys.SKILL])
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
 
 
 @torch.no_grad()
@@ -139,8 +152,15 @@ def train(cfg: Config) -> Path:
     checkpoint = parts.checkpoint(folder / "checkpoints", progress)
     if cfg.resume:
         checkpoint.load()
-    elif cfg.init_from:
-        parts.bbc.load_state_dict(Artifact.load(policy_folder(cfg.init_from), kind="bbc").state)
+    else:
+        warm_up_predictor(parts, cfg.imitation)
+        if cfg.init_from:
+            parts.bbc.load_state_dict(Artifact.load(policy_folder(cfg.init_from), kind="bbc").state)
+        elif cfg.imitation.cloning:
+            privileged = parts.env.reset()[keys.PRIVILEGED].mean(0)
+            clips = parts.dataset.labelled_clips
+            error = clone_behaviour(parts.bbc, clips, privileged, cfg.imitation.cloning, parts.generator)
+            print(f"cloned {len(clips)} labelled clips: squared action error {error:.3f}")
     logger = MCAPLogger(folder.name, folder.parent, resume=cfg.resume is not None)
     start = time.monotonic() - 60.0 * progress["minutes"]
     with Display("bbc_pretrain", cfg.iterations, headline=HEADLINE) as display, cli.interruptible() as interrupted:
@@ -175,6 +195,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
 
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     parts.env.set_skill_probabilities(parts.prior.sampling_probabilities)
+    if parts.env.randomization is not None:
+        delay = cfg.env.action_delay if iteration >= cfg.env.action_delay_from else 0.0
+        parts.env.randomization = replace(parts.env.randomization, action_delay=(delay, delay))
     policy = parts.bbc.deployable_policy() if with_history else parts.bbc.privileged_policy()
     batch = parts.rollout.collect(policy)
     lap("collect")

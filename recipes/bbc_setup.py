@@ -17,8 +17,14 @@ from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.envs import LocomotionEnv
-from agility_rl.envs.randomization import Randomization
-from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm, jump_height_peak, jump_height_window
+from agility_rl.envs.randomization import NOMINAL, Randomization
+from agility_rl.envs.rewards import (
+    LOCOMOTION_REWARDS,
+    RewardTerm,
+    jump_height_peak,
+    jump_height_window,
+    velocity_progress,
+)
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, thigh_contact
 from agility_rl.go2 import features
 from agility_rl.losses import AdaptationLoss, DiscriminatorLoss, PredictorLoss, StateEstimationLoss, functional
@@ -82,6 +88,8 @@ def build(cfg: Config) -> Components:
     terms = dict(LOCOMOTION_REWARDS)
     jump = {"peak": jump_height_peak, "window": jump_height_window}[cfg.env.jump_reward]
     terms["jump_height"] = RewardTerm(cfg.env.jump_weight, jump)
+    if cfg.env.progress_weight:
+        terms["velocity_progress"] = RewardTerm(cfg.env.progress_weight, velocity_progress)
     terms["collision"] = terms["collision"]._replace(weight=cfg.env.collision_weight)
     skills = torch.arange(len(BEHAVIOURS)).repeat_interleave(2000)
     reference = dataset.sample_states(skills, seeds.generator("reference"))
@@ -95,9 +103,10 @@ def build(cfg: Config) -> Components:
         reference=reference.set("skill", skills),
         rewards=terms,
         terminations=(*LOCOMOTION_TERMINATIONS, *([thigh_contact] if cfg.env.end_when_sitting else [])),
-        randomization=Randomization(action_delay=(0.0, cfg.env.action_delay)) if cfg.env.randomize else None,
+        randomization=Randomization() if cfg.env.randomize else NOMINAL if cfg.env.action_delay else None,
         observation_noise=cfg.env.observation_noise,
         push_interval=cfg.env.push_interval,
+        episode_length=cfg.env.episode_length,
         seed=seeds.integer("environment"),
     )
     bbc = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std)

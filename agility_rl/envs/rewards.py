@@ -42,6 +42,18 @@ def yaw_rate(state: LocomotionState) -> Tensor:
     return torch.exp(-(state.command[:, 2] - state.angular_velocity[:, 2]).square() / TRACKING_WIDTH)
 
 
+def velocity_progress(state: LocomotionState) -> Tensor:
+    """``clip(v*_xy . v_xy / |v*_xy|^2, -1, 1)``, and 1 where no velocity is commanded.
+
+    Ours, for beginners: it pays nothing for standing and has a slope there, where the exponential of
+    :func:`linear_velocity` has none. It does not hold the robot back; that is the exponential's part.
+    """
+    wanted = state.command[:, :2]
+    square = wanted.square().sum(-1)
+    along = (wanted * state.linear_velocity[:, :2]).sum(-1)
+    return torch.where(square > 0.0, (along / square.clamp(min=1e-6)).clamp(-1.0, 1.0), 1.0)
+
+
 def jump_height_window(state: LocomotionState) -> Tensor:
     """10 while jumping and within 5 cm of the commanded height (released code)."""
     near = (state.command[:, 3] - state.root_height[:, 0]).abs() < 0.05

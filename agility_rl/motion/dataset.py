@@ -74,6 +74,9 @@ class MotionDataset:
         standing_weight: factor on the weight of unlabelled frames in which the dog stands, which a dog does a third of
             the time: mean speed of the second around them below 0.1 m/s.
 
+    Attributes:
+        labelled_clips: the labelled clips as they are drawn from: resampled, sorted by skill, mirror images included.
+
     Raises:
         MotionError: if there is no unlabelled motion, a labelled clip has no label, or a clip is shorter than a sample.
 
@@ -117,6 +120,7 @@ class MotionDataset:
         self._unlabelled_seconds = sum(clip.num_frames * dt for clip in unlabelled)
         if mirror:
             labelled, unlabelled = _with_mirror_images(labelled), _with_mirror_images(unlabelled)
+        self.labelled_clips = tuple(labelled)
         self._labelled = self._pool(labelled, [BEHAVIOURS.index(str(clip.label)) for clip in labelled], features)
         self._unlabelled = self._pool(unlabelled, [0] * len(unlabelled), features)
         if standing_weight != 1.0:

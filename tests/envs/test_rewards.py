@@ -39,6 +39,12 @@ CASES: list[tuple[str, dict[str, Any], float]] = [
     # errors 0.5 and 0.2 m/s: exp(-(0.25 + 0.04) / 0.25)
     ("linear_velocity", {"command": COMMAND, "linear_velocity": torch.tensor([[0.5, 0.0, 9.0]])}, 0.3134862),
     ("linear_velocity", {"command": COMMAND, "linear_velocity": torch.tensor([[1.0, 0.2, 0.0]])}, 1.0),
+    # (1.0 * 0.5 + 0.2 * 0.1) / (1 + 0.04); twice the commanded velocity is worth no more than the velocity itself
+    ("velocity_progress", {"command": COMMAND, "linear_velocity": torch.tensor([[0.5, 0.1, 9.0]])}, 0.5),
+    ("velocity_progress", {"command": COMMAND, "linear_velocity": torch.tensor([[2.0, 0.4, 0.0]])}, 1.0),
+    ("velocity_progress", {"command": COMMAND, "linear_velocity": torch.tensor([[-9.0, 0.0, 0.0]])}, -1.0),
+    ("velocity_progress", {"command": COMMAND}, 0.0),
+    ("velocity_progress", {"command": 0.0 * COMMAND}, 1.0),
     # error 0.5 rad/s: exp(-1)
     ("yaw_rate", {"command": COMMAND, "angular_velocity": torch.tensor([[9.0, 9.0, 0.5]])}, 0.3678794),
     ("jump_height_window", {"command": COMMAND, "root_height": torch.tensor([[0.46]]), "jumping": JUMPING}, 10.0),
@@ -88,7 +94,7 @@ def test_values(neutral: Neutral, name: str, changes: dict[str, Any], expected: 
 def test_every_term_has_a_value_above() -> None:
     tested = {name for name, _, _ in CASES}
     assert {term.function.__name__ for term in LOCOMOTION_REWARDS.values()} <= tested
-    assert "jump_height_peak" in tested
+    assert {"jump_height_peak", "velocity_progress"} <= tested
 
 
 def test_weights_are_those_of_the_method_notes() -> None:
