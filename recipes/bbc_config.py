@@ -39,8 +39,12 @@ class EnvConfig:
     jump_reward: Literal["peak", "window"] = "peak"
     """``window`` as released, or ``peak``: the highest trunk of the last 0.9 s."""
     jump_weight: float = 6.0
+    jump_width: float = 0.01
+    """Width of the kernel of ``peak`` [m^2]."""
     progress_weight: float = 0.0
     """Weight of a reward for the share of the commanded velocity reached (ours); it pays nothing for standing."""
+    progress_fade: tuple[int, int] = (100, 100)
+    """First iteration and length of its fading away: who walks can learn how a dog does."""
     collision_weight: float = -10.0
     """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
     episode_length: float = 20.0
@@ -177,6 +181,7 @@ CPU = Config(
         collision_weight=-2.0,
         episode_length=8.0,
         progress_weight=4.0,
+        jump_width=0.04,
         end_when_sitting=True,
     ),
     ppo=PPOConfig(
@@ -209,7 +214,14 @@ CPU = Config(
     ),
     adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
 )
-QUICKSTART = replace(CPU, name="quickstart", iterations=110, max_minutes=5.0, env=replace(CPU.env, num_robots=512))
+QUICKSTART = replace(
+    CPU,
+    name="quickstart",
+    iterations=110,
+    max_minutes=5.0,
+    env=replace(CPU.env, num_robots=512),
+    imitation=replace(CPU.imitation, cloning=500),
+)
 SMOKE = replace(
     CPU,
     name="smoke",
@@ -218,7 +230,14 @@ SMOKE = replace(
     env=replace(CPU.env, num_robots=16),
     ppo=replace(CPU.ppo, steps=8, epochs=1, minibatches=2, hidden=(32, 32)),
     imitation=replace(
-        CPU.imitation, minibatches=2, batch_size=32, labelled_batch_size=32, replay=2048, hidden=(32, 32)
+        CPU.imitation,
+        cloning=5,
+        warm_up=5,
+        minibatches=2,
+        batch_size=32,
+        labelled_batch_size=32,
+        replay=2048,
+        hidden=(32, 32),
     ),
     adaptation=replace(CPU.adaptation, every=2),
 )

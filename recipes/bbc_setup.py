@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -86,7 +87,8 @@ def build(cfg: Config) -> Components:
     seeds, im, ppo = seed_everything(cfg.seed), cfg.imitation, cfg.ppo
     dataset = load_motion(cfg.motion, cfg.seed)
     terms = dict(LOCOMOTION_REWARDS)
-    jump = {"peak": jump_height_peak, "window": jump_height_window}[cfg.env.jump_reward]
+    peak = partial(jump_height_peak, width=cfg.env.jump_width)
+    jump = {"peak": peak, "window": jump_height_window}[cfg.env.jump_reward]
     terms["jump_height"] = RewardTerm(cfg.env.jump_weight, jump)
     if cfg.env.progress_weight:
         terms["velocity_progress"] = RewardTerm(cfg.env.progress_weight, velocity_progress)

@@ -60,13 +60,14 @@ def jump_height_window(state: LocomotionState) -> Tensor:
     return 10.0 * (near & state.jumping)
 
 
-def jump_height_peak(state: LocomotionState) -> Tensor:
-    """``exp(-(h* - h_max)^2 / 0.01)`` with the highest trunk of the last 0.9 s.
+def jump_height_peak(state: LocomotionState, width: float = 0.01) -> Tensor:
+    """``exp(-(h* - h_max)^2 / width)`` with the highest trunk of the last 0.9 s.
 
-    Our alternative to the window: it has a slope everywhere and does not pay for staying high.
+    Our alternative to the window: it has a slope everywhere and does not pay for staying high. A beginner misses by
+    0.2 m, where a width of 0.04 m^2 has five times the slope of 0.01.
     """
     miss = state.command[:, 3] - state.peak_height
-    return torch.exp(-miss.square() / 0.01) * state.jumping
+    return torch.exp(-miss.square() / width) * state.jumping
 
 
 def locomotion_height(state: LocomotionState) -> Tensor:

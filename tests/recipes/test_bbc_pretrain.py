@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -67,6 +69,25 @@ def test_a_run_is_never_overwritten(finished: Path) -> None:
     assert result.returncode != 0
     assert "already holds a run" in result.stderr and "Traceback" not in result.stderr
     assert (finished / "whole" / "config.json").read_bytes() == before
+
+
+def test_ctrl_c_saves_what_a_resume_goes_on_from(tmp_path: Path) -> None:
+    command = [sys.executable, str(RECIPE), "smoke", "--runs", str(tmp_path), "--name", "cut", "--iterations", "100000"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 240.0
+        try:
+            while not (tmp_path / "cut" / "policy").is_dir():  # written with the first checkpoint
+                assert process.poll() is None and time.monotonic() < deadline
+                time.sleep(0.2)
+            process.send_signal(signal.SIGINT)
+            output, errors = process.communicate(timeout=120)
+        finally:
+            process.kill()
+    assert process.returncode == 0, errors
+    assert "saved" in output and "stopping after this iteration" in errors
+    done = len(read_scalars(tmp_path / "cut")["reward/task"][0])
+    run(tmp_path, "--resume", str(tmp_path / "cut"), "--iterations", str(done + 1))
+    assert read_scalars(tmp_path / "cut")["reward/task"][0].tolist() == list(range(1, done + 2))
 
 
 @pytest.mark.parametrize(
