@@ -86,15 +86,17 @@ def warm_up_predictor(parts: Components, cfg: ImitationConfig) -> None:
 def expert_batch(
     parts: Components, cfg: ImitationConfig, policy: TensorDictBase, unlabelled: TensorDictBase
 ) -> TensorDictBase:
-    """Expert motion for the discriminator: unlabelled, with a share of labelled motion in the policy's own skills."""
+    """Expert motion for the discriminator: unlabelled, and as much labelled motion as asked for, of those skills that
+    the unlabelled motion shows less often than the policy, so that no skill looks like an expert's by its number."""
     count = round(cfg.labelled_share * cfg.batch_size)
     if count == 0 and not cfg.conditional:
         return unlabelled
-    shares = torch.bincount(policy[keys.SKILL], minlength=len(BEHAVIOURS)).float()
-    labelled = parts.dataset.sample_labelled(count, parts.generator, shares / shares.sum())
     rest = unlabelled[: cfg.batch_size - count].clone(recurse=False)
     logits = parts.predictor(rest.clone(recurse=False))[keys.SKILL_LOGITS]
     rest[keys.SKILL] = torch.multinomial(logits.softmax(-1), 1, generator=parts.generator)[:, 0]
+    wanted, there = (torch.bincount(td[keys.SKILL], minlength=len(BEHAVIOURS)).float() for td in (policy, rest))
+    missing = (wanted * cfg.batch_size / policy.numel() - there).clamp(min=0.0) + 1e-3  # never nothing at all
+    labelled = parts.dataset.sample_labelled(count, parts.generator, missing / missing.sum())
     return torch.cat((labelled.select(keys.MOTION, keys.SKILL), rest.select(keys.MOTION, keys.SKILL)))
 
 

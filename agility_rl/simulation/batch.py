@@ -149,13 +149,22 @@ class BatchSimulator:
         joint_position: Tensor,
         joint_velocity: Tensor,
     ) -> None:
-        """Put the rows of a bool mask ``[N]`` into given states; the other rows stay bit-identical."""
+        """Put the rows of a bool mask ``[N]`` into given states; the other rows stay bit-identical.
+
+        Raises:
+            ValueError: if a state is not finite; the engine would replace it without a word.
+        """
         ids = mask.numpy()
         if not ids.any():
             return
+        qpos = torch.cat((root_position, root_quaternion, joint_position), -1)[mask]
+        qvel = torch.cat((root_linear_velocity, root_angular_velocity, joint_velocity), -1)[mask]
+        finite = torch.isfinite(torch.cat((qpos, qvel), -1)).all(-1)
+        if not bool(finite.all()):
+            rows = mask.nonzero()[:, 0][~finite].tolist()
+            raise ValueError(f"the states of rows {rows[:8]} are not finite; look for NaN in what they come from")
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self._qpos[ids] = torch.cat((root_position, root_quaternion, joint_position), -1)[mask].numpy()
-        self._qvel[ids] = torch.cat((root_linear_velocity, root_angular_velocity, joint_velocity), -1)[mask].numpy()
+        self._qpos[ids], self._qvel[ids] = qpos.numpy(), qvel.numpy()
         self._ctrl[ids] = joint_position[mask].numpy()
         self._previous_target = torch.where(mask[:, None], joint_position, self._previous_target)
         self.batch.forward(ids)

@@ -167,6 +167,17 @@ def test_reset_state_is_what_was_asked() -> None:
         torch.testing.assert_close(getattr(simulator, name), value)
 
 
+def test_reset_refuses_what_the_engine_would_replace_silently() -> None:
+    simulator = BatchSimulator(3, num_threads=1)
+    before = snapshot(simulator)
+    bad = standing(3)
+    bad["joint_velocity"] = torch.where(only(3, 2)[:, None], torch.nan, bad["joint_velocity"])
+    with pytest.raises(ValueError, match=r"rows \[2\] are not finite"):
+        simulator.reset(everyone(3), **bad)
+    assert_same(snapshot(simulator), before, [0, 1, 2])
+    simulator.reset(only(3, 0), **bad)  # the bad row is not asked for
+
+
 def test_velocity_frames() -> None:
     # Rolled 90 degrees: base-frame rotation about x is world rotation about x; linear velocity stays in the world.
     turned = torch.tensor([[0.5**0.5, 0.0, 0.0, 0.5**0.5]])
