@@ -54,3 +54,9 @@ SHIFT_ESTIMATE = "shift_estimate"
 
 REWARD_TERMS = "reward_terms"
 """nested: one float32 ``[*B, 1]`` per reward term, already multiplied by weight and time step."""
+
+MEASUREMENT = "measurement"
+"""float32 ``[*B, 29]``, roll, pitch, angular velocity, joints; :data:`agility_rl.go2.features.MEASUREMENT_LAYOUT`."""
+
+TRANSITION_LOGIT = "transition_logit"
+"""float32 ``[*B, 1]``, D(s, a, s'): high on the robot's transitions, low on the simulator's."""

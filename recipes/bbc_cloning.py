@@ -71,38 +71,62 @@ def demonstration(clip: MotionClip, privileged: Tensor, generator: torch.Generat
     )
 
 
+class Demonstrations:
+    """Labelled clips as what a policy would have seen and done, drawn every behaviour equally often.
+
+    Args:
+        clips: labelled clips at the control rate.
+        privileged: ``[29]``, the robot that the clips are copied for.
+        generator: source of all draws.
+    """
+
+    def __init__(self, clips: Sequence[MotionClip], privileged: Tensor, generator: torch.Generator) -> None:
+        self.generator = generator
+        self.data = torch.cat([demonstration(clip, privileged, generator) for clip in clips])
+        skill = self.data[keys.COMMAND][:, -NUM_BEHAVIOURS:].argmax(-1)
+        self.weight = 1.0 / skill.bincount(minlength=NUM_BEHAVIOURS)[skill]
+        spread = [torch.full((entry.size,), STATE_NOISE[entry.name]) for entry in features.PROPRIOCEPTION_LAYOUT]
+        rest = torch.zeros(self.data[keys.COMMAND].shape[-1] - len(COMMAND_NOISE))
+        self.noises = {
+            keys.PROPRIOCEPTION: torch.cat(spread),
+            keys.ESTIMATE: torch.tensor(ESTIMATE_NOISE),
+            keys.COMMAND: torch.cat((torch.tensor(COMMAND_NOISE), rest)),
+        }
+
+    def sample(self, size: int) -> TensorDict:
+        """Draw demonstrations, their inputs blurred by :data:`STATE_NOISE` and its like."""
+        sample = self.data[torch.multinomial(self.weight, size, replacement=True, generator=self.generator)]
+        for key, noise in self.noises.items():
+            sample[key] = sample[key] + noise * torch.randn(sample[key].shape, generator=self.generator)
+        contact = features.layout_slice(features.PROPRIOCEPTION_LAYOUT, "foot_contact")
+        flipped = torch.rand(size, 4, generator=self.generator) < CONTACT_FLIPS
+        touched = sample[keys.PROPRIOCEPTION][:, contact]
+        sample[keys.PROPRIOCEPTION][:, contact] = torch.where(flipped, -touched, touched)
+        return sample
+
+    def error(self, bbc: BasicBehaviourController, size: int = 512) -> Tensor:
+        """Mean squared difference between the mean action and the clips' [action units squared]; a loss for the actor.
+
+        Beside PPO it keeps behaviours alive that are hard to find again, as in Rajeswaran et al. 2018
+        (arXiv:1709.10087).
+        """
+        sample = self.sample(size)
+        return mse_loss(bbc.trained_actor()[:-1](sample)["loc"], sample[keys.ACTION])
+
+
 def clone_behaviour(
-    bbc: BasicBehaviourController,
-    clips: Sequence[MotionClip],
-    privileged: Tensor,
-    steps: int,
-    generator: torch.Generator,
-    batch_size: int = 512,
-    learning_rate: float = 1e-3,
+    bbc: BasicBehaviourController, demonstrations: Demonstrations, steps: int, learning_rate: float = 1e-3
 ) -> float:
-    """Fit the mean action and the state estimator to labelled clips, every behaviour equally often.
+    """Fit the mean action and the state estimator to demonstrations.
 
     Returns:
         The mean squared error of the last batch, in action units.
     """
-    data = torch.cat([demonstration(clip, privileged, generator) for clip in clips])
-    skill = data[keys.COMMAND][:, -NUM_BEHAVIOURS:].argmax(-1)
-    weight = 1.0 / skill.bincount(minlength=NUM_BEHAVIOURS)[skill]
-    spread = [torch.full((entry.size,), STATE_NOISE[entry.name]) for entry in features.PROPRIOCEPTION_LAYOUT]
-    noises = {keys.PROPRIOCEPTION: torch.cat(spread), keys.ESTIMATE: torch.tensor(ESTIMATE_NOISE)}
-    rest = torch.zeros(data[keys.COMMAND].shape[-1] - len(COMMAND_NOISE))
-    noises[keys.COMMAND] = torch.cat((torch.tensor(COMMAND_NOISE), rest))
-    contact = features.layout_slice(features.PROPRIOCEPTION_LAYOUT, "foot_contact")
     network, optimizer = bbc.trained_actor()[:-1], torch.optim.Adam(bbc.parameters(), lr=learning_rate)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, steps)
     error = torch.zeros(())
     for _ in range(steps):
-        sample = data[torch.multinomial(weight, batch_size, replacement=True, generator=generator)]
-        for key, noise in noises.items():
-            sample[key] = sample[key] + noise * torch.randn(sample[key].shape, generator=generator)
-        flipped = torch.rand(batch_size, 4, generator=generator) < CONTACT_FLIPS
-        touched = sample[keys.PROPRIOCEPTION][:, contact]
-        sample[keys.PROPRIOCEPTION][:, contact] = torch.where(flipped, -touched, touched)
+        sample = demonstrations.sample(512)
         error = mse_loss(network(sample)["loc"], sample[keys.ACTION])
         estimate = bbc.estimator(sample.select(keys.PROPRIOCEPTION))[keys.ESTIMATE]
         optimizer.zero_grad(set_to_none=True)

@@ -103,6 +103,11 @@ class ImitationConfig:
     gradient_penalty: float = 0.1
     cloning: int = 0
     """Steps in which the actor copies the labelled clips before anything else."""
+    cloning_weight: float = 0.0
+    """Weight of copying them in every minibatch of PPO afterwards, so that a behaviour that is hard to find again is
+    not forgotten while the robot learns not to fall."""
+    cloning_fade: tuple[int, int] = (0, 500)
+    """First iteration and length of its fading away."""
     warm_up: int = 0
     """Steps in which the predictor learns the labels before anything else, so that its first rewards mean something."""
     information: float = 1.0

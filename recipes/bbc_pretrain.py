@@ -159,10 +159,8 @@ def train(cfg: Config) -> Path:
         if cfg.init_from:
             parts.bbc.load_state_dict(Artifact.load(policy_folder(cfg.init_from), kind="bbc").state)
         elif cfg.imitation.cloning:
-            privileged = parts.env.reset()[keys.PRIVILEGED].mean(0)
-            clips = parts.dataset.labelled_clips
-            error = clone_behaviour(parts.bbc, clips, privileged, cfg.imitation.cloning, parts.generator)
-            print(f"cloned {len(clips)} labelled clips: squared action error {error:.3f}")
+            error = clone_behaviour(parts.bbc, parts.demonstrations, cfg.imitation.cloning)
+            print(f"cloned {len(parts.dataset.labelled_clips)} labelled clips: squared action error {error:.3f}")
     logger = MCAPLogger(folder.name, folder.parent, resume=cfg.resume is not None)
     start = time.monotonic() - 60.0 * progress["minutes"]
     with Display("bbc_pretrain", cfg.iterations, headline=HEADLINE) as display, cli.interruptible() as interrupted:
@@ -219,7 +217,13 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     if not with_history:
         with torch.no_grad():
             parts.advantage(batch)
-        extra = (lambda sample: parts.adaptation_loss(sample)["loss_privileged"]) if weight > 0.0 else None
+        kept = cfg.imitation.cloning_weight
+        kept -= functional.linear_ramp(iteration, *cfg.imitation.cloning_fade, kept)
+
+        def extra(sample: TensorDictBase) -> Tensor:
+            loss = parts.adaptation_loss(sample)["loss_privileged"] if weight > 0.0 else torch.zeros(())
+            return loss + kept * parts.demonstrations.error(parts.bbc) if kept > 0.0 else loss
+
         metrics |= parts.ppo(batch, parts.generator, extra)
     lap("policy")
     metrics |= update_adaptation(parts, cfg.adaptation.minibatches, batch)

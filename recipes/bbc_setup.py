@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from bbc_cloning import Demonstrations
 from bbc_config import Config, MotionConfig
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -18,7 +19,7 @@ from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.envs import LocomotionEnv
-from agility_rl.envs.randomization import NOMINAL, Randomization
+from agility_rl.envs.randomization import NOMINAL, Randomization, sample_parameters
 from agility_rl.envs.rewards import (
     LOCOMOTION_REWARDS,
     RewardTerm,
@@ -52,6 +53,7 @@ class Components:
 
     seeds: Seeds
     dataset: MotionDataset
+    demonstrations: Demonstrations
     env: LocomotionEnv
     bbc: BasicBehaviourController
     critic: Critic
@@ -170,6 +172,9 @@ def build(cfg: Config) -> Components:
     return Components(
         seeds=seeds,
         dataset=dataset,
+        demonstrations=Demonstrations(
+            dataset.labelled_clips, sample_parameters(1, NOMINAL, torch.Generator())[1][0], seeds.generator("cloning")
+        ),
         env=env,
         bbc=bbc,
         critic=critic,

@@ -60,9 +60,18 @@ MOTION_LAYOUT: tuple[Entry, ...] = (
 )
 """49 numbers of one discriminator frame."""
 
+MEASUREMENT_LAYOUT: tuple[Entry, ...] = (
+    Entry("roll_pitch", 2, "rad", 1.0, 0.01),
+    Entry("angular_velocity", 3, "rad/s, base frame", 1.0, 0.2),
+    Entry("joint_position", 12, "rad", 1.0, 0.01),
+    Entry("joint_velocity", 12, "rad/s", 1.0, 1.5),
+)
+"""29 numbers of a state as a robot log holds it, in SI units: no trunk velocity, no contact. Noise as above."""
+
 NUM_PROPRIOCEPTION = sum(entry.size for entry in PROPRIOCEPTION_LAYOUT)
 NUM_EXPLICIT = sum(entry.size for entry in EXPLICIT_LAYOUT)
 NUM_MOTION = sum(entry.size for entry in MOTION_LAYOUT)
+NUM_MEASUREMENT = sum(entry.size for entry in MEASUREMENT_LAYOUT)
 
 
 def layout_slice(layout: tuple[Entry, ...], name: str) -> slice:
@@ -121,6 +130,21 @@ def proprioception(
         ),
         -1,
     )
+
+
+def measurement(roll_pitch: Tensor, angular_velocity: Tensor, joint_position: Tensor, joint_velocity: Tensor) -> Tensor:
+    """State of system identification, from a log and from a simulation alike.
+
+    Args:
+        roll_pitch: ``[*B, 2]`` [rad].
+        angular_velocity: ``[*B, 3]`` [rad/s], base frame.
+        joint_position: ``[*B, 12]`` [rad].
+        joint_velocity: ``[*B, 12]`` [rad/s].
+
+    Returns:
+        ``[*B, 29]`` laid out as :data:`MEASUREMENT_LAYOUT`.
+    """
+    return torch.cat((roll_pitch, angular_velocity, joint_position, joint_velocity), -1)
 
 
 def explicit(root_height: Tensor, linear_velocity: Tensor) -> Tensor:

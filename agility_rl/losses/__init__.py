@@ -5,5 +5,12 @@ from __future__ import annotations
 from agility_rl.losses.adaptation import AdaptationLoss, StateEstimationLoss
 from agility_rl.losses.discriminator import DiscriminatorLoss
 from agility_rl.losses.predictor import PredictorLoss
+from agility_rl.losses.transition_discriminator import TransitionDiscriminatorLoss
 
-__all__ = ["AdaptationLoss", "DiscriminatorLoss", "PredictorLoss", "StateEstimationLoss"]
+__all__ = [
+    "AdaptationLoss",
+    "DiscriminatorLoss",
+    "PredictorLoss",
+    "StateEstimationLoss",
+    "TransitionDiscriminatorLoss",
+]

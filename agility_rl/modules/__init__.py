@@ -11,6 +11,7 @@ from agility_rl.modules.estimator import StateEstimator
 from agility_rl.modules.normalization import FeatureNormalizer
 from agility_rl.modules.predictor import Predictor
 from agility_rl.modules.skill_prior import SkillPrior
+from agility_rl.modules.transition_discriminator import TransitionDiscriminator
 
 __all__ = [
     "BasicBehaviourController",
@@ -25,4 +26,5 @@ __all__ = [
     "PrivilegedEncoder",
     "SkillPrior",
     "StateEstimator",
+    "TransitionDiscriminator",
 ]

@@ -16,6 +16,7 @@ POSE = torch.tensor(constants.DEFAULT_POSE)
 def test_sizes_follow_from_the_layouts() -> None:
     assert features.NUM_PROPRIOCEPTION == 2 + 3 + 12 + 12 + 12 + 4 == 45
     assert features.NUM_EXPLICIT == 4
+    assert features.NUM_MEASUREMENT == 2 + 3 + 12 + 12 == 29
     assert features.NUM_MOTION == 2 + 1 + 3 + 3 + 12 + 12 + 12 + 4 == 49
 
 
@@ -46,6 +47,15 @@ def test_proprioception_by_hand() -> None:
     assert vector[17:29].tolist() == pytest.approx([0.5] * 12)
     assert vector[29:41].tolist() == [7.0] * 12
     assert vector[41:].tolist() == [0.5, -0.5, 0.5, -0.5]
+
+
+def test_a_measurement_is_in_plain_units_and_without_trunk_velocity() -> None:
+    parts = {"roll_pitch": torch.randn(2), "angular_velocity": torch.randn(3)}
+    parts |= {"joint_position": torch.randn(12), "joint_velocity": torch.randn(12)}
+    vector = features.measurement(**parts)
+    assert [entry.name for entry in features.MEASUREMENT_LAYOUT] == list(parts)
+    for name, value in parts.items():
+        assert torch.equal(vector[features.layout_slice(features.MEASUREMENT_LAYOUT, name)], value)
 
 
 def test_feet_are_turned_upright_but_not_by_yaw() -> None:

@@ -46,6 +46,9 @@ def test_cloning_fits_the_actions(module: Callable[[str], ModuleType]) -> None:
     cloning = module("bbc_cloning")
     torch.manual_seed(0)
     bbc = BasicBehaviourController(hidden=(64, 64))
-    first = cloning.clone_behaviour(bbc, clips, PRIVILEGED, 2, torch.Generator().manual_seed(0))
-    last = cloning.clone_behaviour(bbc, clips, PRIVILEGED, 150, torch.Generator().manual_seed(0))
-    assert last < 0.5 * first
+    shown = cloning.Demonstrations(clips, PRIVILEGED, torch.Generator().manual_seed(0))
+    before = shown.error(bbc).item()
+    last = cloning.clone_behaviour(bbc, shown, 150)
+    assert last < 0.5 * before
+    shown.error(bbc).backward()
+    assert bbc.actor.network.std.grad is None  # copying moves the mean, never the exploration

@@ -1,0 +1,31 @@
+"""What gathers data and searches with it: EASI's collector, its evolution strategy, and robot logs."""
+
+from __future__ import annotations
+
+from agility_rl.collectors.behaviour_policy import BehaviourPolicy
+from agility_rl.collectors.easi import EASICollector, one_thread
+from agility_rl.collectors.evolution import EvolutionStrategy
+from agility_rl.collectors.log_formats import RobotLogError
+from agility_rl.collectors.log_recording import RobotLogRecorder, record_robot_log
+from agility_rl.collectors.parameters import GAINS, Parameter, ParameterSpace
+from agility_rl.collectors.robot_log import RobotLog
+from agility_rl.collectors.rollout import fallen, roll_out, standing_states
+from agility_rl.collectors.sensors import RobotSensors
+
+__all__ = [
+    "GAINS",
+    "BehaviourPolicy",
+    "EASICollector",
+    "EvolutionStrategy",
+    "Parameter",
+    "ParameterSpace",
+    "RobotLog",
+    "RobotLogError",
+    "RobotLogRecorder",
+    "RobotSensors",
+    "fallen",
+    "one_thread",
+    "record_robot_log",
+    "roll_out",
+    "standing_states",
+]

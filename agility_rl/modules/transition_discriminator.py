@@ -1,0 +1,140 @@
+"""The discriminator of EASI: does a transition come from the robot or from the simulator?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from agility_rl.go2 import constants, features
+from agility_rl.keys import ACTION, MEASUREMENT, TRANSITION_LOGIT
+from agility_rl.modules.mlp import mlp
+from agility_rl.modules.normalization import FeatureNormalizer
+
+NORMALIZED_TRANSITION = "normalized_transition"
+"""float32 ``[*B, 2 S + A]``, what the network sees: the gradient penalty differentiates with respect to this."""
+
+
+class TransitionDiscriminator(TensorDictModuleBase):
+    r"""Judge transitions: :math:`\tilde D(s, a, s')`, high for the robot, low for the simulator.
+
+    The simulator's physics shows in how a state follows from the last, which policy and terrain hide the less, the more
+    the network sees of it: with ``difference`` the third input is s' - s, scaled by its own, much smaller, spread. The
+    two forms carry the same information; at 50 Hz s' alone is nearly s.
+
+    .. math:: \tilde D(s, a, s') = \mathrm{MLP}(\mathrm{norm}([s, a, s'])) \quad\text{or}\quad
+              \mathrm{MLP}(\mathrm{norm}([s, a, s' - s]))
+
+    Source: Algorithm S2, D-tilde of Eq. (13); sizes 128-128 with ReLU: EASI's release (method notes, section 6.2).
+    Differs from it: inputs are normalised by fixed statistics of the log, because radians and rad/s differ by a factor
+    of fifty and clipped weights cannot make up for it.
+
+    Keys read:
+        measurement          float32 ``[*B, S]``  state, as measured [SI units]
+        action               float32 ``[*B, A]``  action taken in it [action units]
+        (next, measurement)  float32 ``[*B, S]``  state one control step later
+    Keys written:
+        transition_logit       float32 ``[*B, 1]``        D(s, a, s'), unbounded [1]
+        normalized_transition  float32 ``[*B, 2 S + A]``  what the network sees [1]
+
+    Args:
+        num_measurements: S.
+        num_actions: A.
+        hidden: sizes of the hidden layers.
+        normalizer: scales the ``2 S + A`` inputs; ``None`` takes them as they are.
+        difference: give the network s' - s instead of s'; the normaliser's statistics are then of s' - s as well.
+        measurement_key: key of the state; the following state stands under ``("next", measurement_key)``.
+        action_key: key of the action.
+        out_key: key of the logit.
+        normalized_key: key of the normalised inputs.
+
+    Raises:
+        ValueError: if the normaliser has statistics of another size, or an input has another size (at the call).
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({
+        ...     "measurement": torch.zeros(8, 29), "action": torch.zeros(8, 12),
+        ...     "next": TensorDict({"measurement": torch.zeros(8, 29)}, [8]),
+        ... }, [8])
+        >>> TransitionDiscriminator()(td)["transition_logit"].shape
+        torch.Size([8, 1])
+        >>> TransitionDiscriminator.from_transitions(td, difference=True).normalizer.mean.shape
+        torch.Size([70])
+    """
+
+    def __init__(
+        self,
+        num_measurements: int = features.NUM_MEASUREMENT,
+        num_actions: int = constants.NUM_JOINTS,
+        hidden: Sequence[int] = (128, 128),
+        *,
+        normalizer: FeatureNormalizer | None = None,
+        difference: bool = False,
+        measurement_key: NestedKey = MEASUREMENT,
+        action_key: NestedKey = ACTION,
+        out_key: NestedKey = TRANSITION_LOGIT,
+        normalized_key: NestedKey = NORMALIZED_TRANSITION,
+    ) -> None:
+        super().__init__()
+        size = 2 * num_measurements + num_actions
+        if normalizer is not None and normalizer.mean.shape[0] != size:
+            raise ValueError(
+                f"the normaliser has statistics of {normalizer.mean.shape[0]} numbers, but a transition has "
+                f"2 * {num_measurements} + {num_actions} = {size}"
+            )
+        self.sizes = (num_measurements, num_actions, num_measurements)
+        self.difference = difference
+        self.normalizer = normalizer
+        self.layers = mlp(size, hidden, activation=nn.ReLU)
+        self.head = nn.Linear(hidden[-1], 1)
+        nn.init.zeros_(self.head.bias)
+        self.in_keys = [measurement_key, action_key, _following(measurement_key)]
+        self.out_keys = [out_key, normalized_key]
+
+    @classmethod
+    def from_transitions(cls, transitions: TensorDictBase, *, clip: float = 10.0, **options: Any) -> Self:
+        """Build a discriminator whose normaliser has the statistics of given transitions, usually the robot's.
+
+        Args:
+            transitions: TensorDict with the keys that the discriminator reads.
+            clip: bound of the normalised inputs [1].
+            **options: further arguments of the class; the sizes follow from the transitions.
+        """
+        state = transitions.get(options.get("measurement_key", MEASUREMENT))
+        action = transitions.get(options.get("action_key", ACTION))
+        network = cls(state.shape[-1], action.shape[-1], **options)
+        inputs = network.assemble(transitions).detach().flatten(0, -2)
+        # A constant entry says nothing; a tiny deviation would blow the simulator's noise in it up to the clip.
+        std = inputs.std(0, correction=0).clamp_min(1e-3)
+        network.normalizer = FeatureNormalizer(inputs.mean(0), std, clip=clip)
+        return network
+
+    def assemble(self, tensordict: TensorDictBase) -> Tensor:
+        """Raw inputs ``[*B, 2 S + A]``.
+
+        Raises:
+            ValueError: if one has another size.
+        """
+        inputs = [tensordict.get(key) for key in self.in_keys]
+        for key, value, size in zip(self.in_keys, inputs, self.sizes):
+            if value.shape[-1] != size:
+                raise ValueError(f"{key!r} must be [*B, {size}], got {list(value.shape)}")
+        state, action, following = inputs
+        return torch.cat((state, action, following - state if self.difference else following), -1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the logit and the normalised inputs."""
+        inputs = self.assemble(tensordict)
+        normalized = inputs if self.normalizer is None else self.normalizer(inputs)
+        tensordict.set(self.out_keys[0], self.head(self.layers(normalized)))
+        tensordict.set(self.out_keys[1], normalized)
+        return tensordict
+
+
+def _following(key: NestedKey) -> NestedKey:
+    return ("next", key) if isinstance(key, str) else ("next", *key)

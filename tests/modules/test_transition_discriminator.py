@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from agility_rl.modules import FeatureNormalizer, TransitionDiscriminator
+
+S, A = 3, 2
+
+
+def transitions(count: int = 5, **following: Tensor) -> TensorDict:
+    state, action = torch.randn(count, S), torch.randn(count, A)
+    after = following.get("following", state + 0.1 * torch.randn(count, S))
+    return TensorDict({"measurement": state, "action": action, "next": {"measurement": after}}, [count])
+
+
+def by_hand(network: TransitionDiscriminator, inputs: np.ndarray) -> np.ndarray:
+    w1, b1, w2, b2, w3, b3 = (p.detach().double().numpy() for p in network.parameters())
+    if network.normalizer is not None:
+        inputs = (inputs - network.normalizer.mean.numpy()) / network.normalizer.std.numpy()
+    hidden = np.maximum(np.maximum(inputs @ w1.T + b1, 0) @ w2.T + b2, 0)
+    return hidden @ w3.T + b3
+
+
+@pytest.mark.parametrize("difference", [False, True])
+@pytest.mark.parametrize("normalized", [False, True])
+def test_values_against_numpy(difference: bool, normalized: bool) -> None:
+    normalizer = FeatureNormalizer(torch.linspace(-0.1, 0.1, 8), torch.linspace(0.5, 2.0, 8)) if normalized else None
+    network, td = TransitionDiscriminator(S, A, (7, 6), normalizer=normalizer, difference=difference), transitions()
+    state, action, after = (td[key].double().numpy() for key in ("measurement", "action", ("next", "measurement")))
+    expected = by_hand(network, np.concatenate((state, action, after - state if difference else after), -1))
+    out = network(td)
+    np.testing.assert_allclose(out["transition_logit"].detach().numpy(), expected, rtol=1e-4, atol=1e-6)
+    assert out["normalized_transition"].shape == (5, 8)
+
+
+def test_default_sizes_are_those_of_the_paper() -> None:
+    shapes = [tuple(p.shape) for p in TransitionDiscriminator().parameters() if p.ndim == 2]
+    assert shapes == [(128, 70), (128, 128), (1, 128)]
+
+
+def test_statistics_of_the_log_make_its_inputs_standard() -> None:
+    td = transitions(400)
+    td["measurement"] = td["measurement"] * torch.tensor([100.0, 0.01, 1.0]) + 5.0
+    td["next", "measurement"] = td["measurement"] + 0.02 * torch.randn(400, S)
+    network = TransitionDiscriminator.from_transitions(td, difference=True)
+    normalized = network(td.clone())["normalized_transition"]
+    torch.testing.assert_close(normalized.mean(0), torch.zeros(8), atol=1e-4, rtol=0)
+    torch.testing.assert_close(normalized.std(0, correction=0), torch.ones(8), atol=1e-3, rtol=0)
+
+
+def test_a_constant_input_says_nothing_instead_of_everything() -> None:
+    td = transitions(50)
+    td["action"] = torch.zeros(50, A)
+    network = TransitionDiscriminator.from_transitions(td)
+    assert network.normalizer.std[S : S + A].tolist() == pytest.approx([1e-3] * A)
+    td["action"] = torch.full((50, A), 1e6)
+    assert network(td)["normalized_transition"].abs().max() <= 10.0
+
+
+def test_any_batch_shape_and_nested_keys() -> None:
+    network = TransitionDiscriminator(
+        S, A, (4,), measurement_key=("o", "m"), action_key=("o", "a"), out_key=("d", "x"), normalized_key=("d", "n")
+    )
+    entry = {"o": {"m": torch.randn(4, 6, S), "a": torch.randn(4, 6, A)}}
+    td = TensorDict({**entry, "next": {"o": {"m": torch.randn(4, 6, S)}}}, [4, 6])
+    assert network.in_keys == [("o", "m"), ("o", "a"), ("next", "o", "m")]
+    assert network(td)["d", "x"].shape == (4, 6, 1)
+    flat = network(td.exclude("d").reshape(-1))["d", "x"]
+    torch.testing.assert_close(flat.reshape(4, 6, 1), td["d", "x"])
+
+
+def test_state_dict_carries_the_statistics() -> None:
+    td = transitions(30)
+    one = TransitionDiscriminator.from_transitions(td)
+    other = TransitionDiscriminator(S, A, normalizer=FeatureNormalizer(torch.zeros(8), torch.ones(8)))
+    other.load_state_dict(one.state_dict())
+    assert torch.equal(one(td.clone())["transition_logit"], other(td.clone())["transition_logit"])
+
+
+def test_permuting_the_batch_permutes_the_logits() -> None:
+    network, td, order = TransitionDiscriminator(S, A), transitions(6), torch.tensor([3, 1, 5, 0, 2, 4])
+    torch.testing.assert_close(network(td[order])["transition_logit"], network(td)["transition_logit"][order])
+
+
+def test_errors() -> None:
+    with pytest.raises(ValueError, match=r"7 numbers, but a transition has 2 \* 3 \+ 2 = 8"):
+        TransitionDiscriminator(S, A, normalizer=FeatureNormalizer(torch.zeros(7), torch.ones(7)))
+    with pytest.raises(ValueError, match=r"'action' must be \[\*B, 2\], got \[5, 4\]"):
+        TransitionDiscriminator(S, A)(transitions().set("action", torch.zeros(5, 4)))
