@@ -44,7 +44,9 @@ class EnvConfig:
     progress_weight: float = 0.0
     """Weight of a reward for the share of the commanded velocity reached (ours); it pays nothing for standing."""
     progress_fade: tuple[int, int] = (100, 100)
-    """First iteration and length of its fading away: who walks can learn how a dog does."""
+    """First iteration and length of its fading: who walks can learn how a dog does."""
+    progress_left: float = 0.0
+    """Weight that is left of it; without any, a slow walk turns into standing."""
     collision_weight: float = -10.0
     """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
     episode_length: float = 20.0
@@ -187,8 +189,9 @@ CPU = Config(
         episode_length=8.0,
         progress_weight=8.0,
         progress_fade=(120, 120),
-        jump_width=0.04,
-        end_when_sitting=True,
+        progress_left=0.5,
+        jump_weight=16.0,
+        jump_width=0.03,
     ),
     ppo=PPOConfig(
         epochs=4,
@@ -196,9 +199,9 @@ CPU = Config(
         learning_rate=3e-4,
         max_learning_rate=2e-3,
         desired_kl=0.02,
-        gamma=0.97,
-        entropy=0.0005,
-        initial_std=0.4,
+        gamma=0.98,
+        entropy=0.002,
+        initial_std=0.5,
         hidden=(256, 128, 64),
         critic_history=False,
     ),
@@ -217,8 +220,9 @@ CPU = Config(
         information=0.3,
         information_ramp=(50, 300),
         prior_weight=2e-3,
-        imitation_reward=1.0,
-        skill_reward=1.0,
+        prior_temperature=100.0,
+        imitation_reward=2.0,
+        skill_reward=2.0,
         skill_floor=-15.0,
         task_reward=0.25,
         height_deviation=0.06,

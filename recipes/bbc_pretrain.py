@@ -194,7 +194,8 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         times[f"time/{name}"], clock = now - clock, now
 
     if progress := parts.env.rewards.get("velocity_progress"):
-        faded = functional.linear_ramp(iteration, *cfg.env.progress_fade, cfg.env.progress_weight)
+        fading = cfg.env.progress_weight - cfg.env.progress_left
+        faded = functional.linear_ramp(iteration, *cfg.env.progress_fade, fading)
         parts.env.rewards["velocity_progress"] = progress._replace(weight=cfg.env.progress_weight - faded)
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     parts.env.set_skill_probabilities(parts.prior.sampling_probabilities)

@@ -1,0 +1,251 @@
+"""Stage 2a: find the distribution of simulator parameters under which the simulator moves as the robot's log does.
+
+Source: Fu et al. 2025, supplement S2, Algorithm S2, Table S3; method notes, section 6.
+
+In:  a robot log (``--log FILE``) and the policy that made it (``--policy RUN``; without one, the open-loop trot of
+     ``record_log.py``).
+Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap`` (the distribution of every generation), ``checkpoints/``,
+     ``result.json``, ``figures/convergence.png``, and the identifiability table on the screen.
+
+    python recipes/record_log.py --log logs/target.mcap --policy runs/my_run --draw
+    python recipes/easi.py cpu --log logs/target.mcap --policy runs/my_run --truth logs/target.truth.json
+    python recipes/easi.py cpu --resume runs/easi --generations 80      # goes on exactly where it stopped
+
+Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper`` (Table S3).
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from easi_config import PRESETS, Config, CriticConfig
+from easi_report import (
+    draw_convergence,
+    identify,
+    load_truth,
+    physical,
+    print_result,
+    relative_error,
+    survivor_correlation,
+    write_result,
+)
+from log_policy import checksum, make_actor
+from rich.console import Console
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from agility_rl.collectors import EASICollector, EvolutionStrategy, ParameterSpace, RobotLog, one_thread
+from agility_rl.collectors.parameters import Parameter
+from agility_rl.losses import TransitionDiscriminatorLoss
+from agility_rl.modules import TransitionDiscriminator
+from agility_rl.record import MCAPLogger, read_scalars
+from agility_rl.simulation import Simulator, make_simulator
+from agility_rl.training import cli
+from agility_rl.training.checkpoint import RunCheckpoint
+from agility_rl.training.display import Display
+from agility_rl.training.seeding import Seeds, seed_everything
+
+HEADLINE = ("time/minutes", "error/mean", "distance", "score/mean", "score/best", "falls_per_minute")
+
+
+@dataclass
+class Components:
+    """Everything a search is made of."""
+
+    seeds: Seeds
+    real: TensorDict
+    space: ParameterSpace
+    search: EvolutionStrategy
+    simulator: Simulator
+    collector: EASICollector
+    critic: TransitionDiscriminator
+    loss: TransitionDiscriminatorLoss
+    optimizer: torch.optim.Optimizer
+    survivors: Tensor
+    """``[D, D]``, sum over the generations of their survivors' correlation."""
+    truth: Tensor | None
+    inputs: dict[str, Any]
+    """What the search depends on and the run folder does not hold."""
+
+    def checkpoint(self, folder: Path, progress: dict[str, float]) -> RunCheckpoint:
+        """All that a bit-exact continuation needs; a collection begins with a reset, so no simulator is saved."""
+        names = ("seeds", "search", "critic", "optimizer", "survivors")
+        return RunCheckpoint(folder, progress=progress, **{name: getattr(self, name) for name in names})
+
+
+@one_thread()
+def build(cfg: Config) -> Components:
+    """Read the log, construct simulations, search and critic."""
+    if cfg.log is None:
+        raise ValueError("give --log FILE, a robot log in .mcap, .csv or .npz; record_log.py makes one")
+    if cfg.generations < 1 or cfg.trajectory_length < 1 or cfg.noise < 0.0 or cfg.critic.updates < 1:
+        raise ValueError("expected --generations, --trajectory-length and --critic.updates from 1, and --noise from 0")
+    seeds, search = seed_everything(cfg.seed), cfg.search
+    real = RobotLog.load(cfg.log).transitions()
+    linear = {"scale": "linear"} if search.scale == "linear" else {}
+    space = ParameterSpace([Parameter.named(name, span=search.span, **linear) for name in search.parameters])
+    actor = make_actor(cfg.policy, cfg.behaviours, cfg.command_seconds)
+    recording = {
+        "policy": actor.name,
+        "behaviours": list(cfg.behaviours),
+        "command_seconds": cfg.command_seconds,
+        "friction_loss": actor.friction_loss if cfg.friction_loss is None else cfg.friction_loss,
+        "noise": cfg.noise,
+        "latency": cfg.latency,
+    }
+    truth = None
+    if cfg.truth is not None:
+        truth, recorded = load_truth(cfg.truth, space)
+        for name, value in recording.items():
+            if recorded.get(name) != value:
+                print(f"warning: the log was recorded with {name} {recorded.get(name)}, the search has {value}")
+    simulator = make_simulator(
+        num_simulations=cfg.num_robots, num_threads=cfg.num_threads, friction_loss=recording["friction_loss"]
+    )
+    low, high = torch.zeros(len(space)), torch.ones(len(space))
+    lower, upper = (low, high) if search.bounded else space.limits
+    critic = TransitionDiscriminator.from_transitions(real, hidden=cfg.critic.hidden, difference=cfg.critic.difference)
+    loss = TransitionDiscriminatorLoss(
+        critic, weight_clip=cfg.critic.weight_clip, gradient_penalty=cfg.critic.gradient_penalty
+    )
+    return Components(
+        seeds=seeds,
+        real=real,
+        space=space,
+        search=EvolutionStrategy(
+            low,
+            high,
+            population=cfg.num_robots,
+            survival_rate=search.survival_rate,
+            covariance=search.covariance,
+            centre=search.centre,
+            min_std=search.min_std,
+            lower=lower,
+            upper=upper,
+            generator=seeds.generator("search"),
+        ),
+        simulator=simulator,
+        collector=EASICollector(
+            simulator,
+            space,
+            actor.policy,
+            generator=seeds.generator("collector"),
+            num_steps=cfg.trajectory_length,
+            noise=cfg.noise,
+            latency=cfg.latency,
+        ),
+        critic=critic,
+        loss=loss,
+        optimizer=torch.optim.RMSprop(critic.parameters(), lr=cfg.critic.learning_rate),
+        survivors=torch.zeros(len(space), len(space), dtype=torch.float64),
+        truth=truth,
+        inputs={"log": checksum(cfg.log), **recording},
+    )
+
+
+@one_thread()
+def update_critic(parts: Components, cfg: CriticConfig, transitions: TensorDictBase) -> dict[str, Tensor]:
+    """Algorithm S2, lines 9 to 12: K steps down equation (13); returns the last losses."""
+    generator = parts.seeds.generator("batches")
+    losses = TensorDict()
+    for _ in range(cfg.updates):
+        policy = parts.collector.sample(transitions, generator, cfg.batch_per_robot)
+        rows = torch.randint(len(parts.real), (len(policy),), generator=generator)
+        parts.loss.clip_weights()
+        losses = parts.loss(TensorDict({"expert": parts.real[rows], "policy": policy}))
+        total = sum(value for name, value in losses.items() if name.startswith("loss_"))
+        parts.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        parts.optimizer.step()
+    return {name: value.detach() for name, value in losses.items()}
+
+
+def evolve(parts: Components, cfg: Config) -> dict[str, float]:
+    """One generation of Algorithm S2; returns metrics by name."""
+    clock = time.perf_counter()
+    individuals = parts.search.ask()
+    transitions = parts.collector.collect(individuals)
+    collected = time.perf_counter()
+    metrics: dict[str, Any] = update_critic(parts, cfg.critic, transitions)
+    scores = parts.collector.score(parts.critic, transitions)
+    parts.search.tell(individuals, scores)
+    with one_thread():
+        parts.survivors += survivor_correlation(parts.search, individuals, scores)
+    metrics |= {"score/mean": scores[scores.isfinite()].mean(), "score/best": scores.max()}
+    mean, std = physical(parts.search, parts.space)
+    metrics |= {f"mean/{name}": value for name, value in zip(parts.space.names, mean)}
+    metrics |= {f"std/{name}": value for name, value in zip(parts.space.names, std)}
+    if parts.truth is not None:
+        error = relative_error(mean, parts.truth, parts.space)
+        metrics |= {f"error/{name}": value for name, value in zip(parts.space.names, error)}
+        metrics["error/mean"] = error.mean()
+    metrics["falls_per_minute"] = transitions["next", "fallen"].float().mean() * 60.0 / parts.simulator.control_dt
+    metrics["unusable_transitions"] = (~transitions["collector", "mask"]).float().mean()
+    metrics |= {"time/collect": collected - clock, "time/critic": time.perf_counter() - collected}
+    return {name: float(value) for name, value in metrics.items()}
+
+
+def train(cfg: Config, console: Console | None = None) -> Path:
+    """Algorithm S2; returns the run folder."""
+    wide = None if sys.stdout.isatty() else 120  # a file has no width, and a table folded to 80 columns is hard to read
+    console = console or Console(soft_wrap=True, highlight=False, width=wide)
+    if cfg.resume is not None:  # a run goes on with its own options; only how long and how fast may change
+        own = cli.read_config(cfg.resume, Config)
+        changed = {name: getattr(cfg, name) for name in ("resume", "generations", "max_minutes", "num_threads")}
+        cfg = replace(own, **changed)
+    parts = build(cfg)
+    if cfg.resume is not None:
+        check_inputs(cfg.resume, parts.inputs)
+    folder = cfg.resume or cfg.runs / cfg.name
+    folder = cli.start_run(cfg, folder, resume=cfg.resume is not None, recipe="easi", inputs=parts.inputs)
+    progress = {"generation": 0, "minutes": 0.0}
+    checkpoint = parts.checkpoint(folder / "checkpoints", progress)
+    if cfg.resume is not None:
+        checkpoint.load()
+    logger = MCAPLogger(folder.name, folder.parent, resume=cfg.resume is not None)
+    start = time.monotonic() - 60.0 * progress["minutes"]
+    display = Display("easi", cfg.generations, headline=HEADLINE, lines_every=1, console=console)
+    with display, cli.interruptible() as interrupted:
+        while progress["generation"] < cfg.generations and not interrupted():
+            metrics = evolve(parts, cfg)
+            progress["generation"] += 1
+            progress["minutes"] = metrics["time/minutes"] = (time.monotonic() - start) / 60.0
+            logger.log_metrics(metrics, step=progress["generation"])
+            display.update(int(progress["generation"]), metrics)
+            if progress["generation"] % cfg.checkpoint_every == 0:
+                checkpoint.save(int(progress["generation"]))
+            if cfg.max_minutes is not None and progress["minutes"] >= cfg.max_minutes:
+                break
+    checkpoint.save(int(progress["generation"]))
+    logger.close()
+    parts.simulator.close()
+    if parts.search.generation:
+        found = identify(parts.search, parts.space, parts.survivors / parts.search.generation)
+        print_result(console, parts.search, parts.space, found, parts.truth)
+        write_result(folder, parts.search, parts.space, found, parts.truth)
+        draw_convergence(folder / "figures" / "convergence.png", read_scalars(folder), parts.space, parts.truth)
+    console.print(f"saved {folder}", markup=False)
+    return folder
+
+
+def check_inputs(run: Path, inputs: dict[str, Any]) -> None:
+    """Refuse to go on with another log or policy than a run began with.
+
+    Raises:
+        ValueError: naming what changed.
+    """
+    began = json.loads((run / cli.CONFIG_FILE).read_text(encoding="utf-8")).get("inputs", {})
+    for name, value in inputs.items():
+        if began.get(name) != value:
+            raise ValueError(f"{run} began with {name} {began.get(name)}, found {value}; resume with the same one")
+
+
+if __name__ == "__main__":
+    with cli.one_line_errors():
+        train(cli.from_presets(PRESETS, doc=__doc__))

@@ -1,0 +1,105 @@
+"""Options and presets of the search for the simulator that explains a robot log.
+
+``paper`` holds Table S3 to the number, and the values of EASI's release (method notes, section 6) where it is silent;
+``cpu`` is cut down for two cores.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from agility_rl.collectors import GAINS
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    parameters: tuple[str, ...] = GAINS
+    """What is searched: the six gains (supplement S2), or any names that ``Parameter.named`` knows."""
+    span: float = 3.0
+    """First range [1/span, span] x nominal (method notes, section 6.3)."""
+    scale: Literal["log", "linear"] = "log"
+    """``linear`` as in EASI's release; ``log`` gives a third and three times the nominal value equal room (ours)."""
+    bounded: bool = False
+    """Clip individuals to the first range, as in EASI's sim-to-sim runs; physical limits hold in any case."""
+    survival_rate: float = 0.5
+    """Table S3."""
+    covariance: Literal["diagonal", "full"] = "diagonal"
+    """``diagonal`` as in EASI's release; ``full`` follows, and shows, parameters that make up for each other."""
+    centre: Literal["new", "old"] = "new"
+    """Mean about which the spread is taken; ``new`` as in EASI's release, ``old`` reaches far outside the range."""
+    min_std: float = 0.0
+    """Least standard deviation in shares of the first range; 0 as in EASI's release."""
+
+
+@dataclass(frozen=True)
+class CriticConfig:
+    updates: int = 10
+    """Updates in a generation, K (Table S3)."""
+    learning_rate: float = 3e-4
+    """Of RMSprop (Table S3)."""
+    hidden: tuple[int, ...] = (128, 128)
+    """EASI's release (method notes, section 6.2)."""
+    weight_clip: float | None = 0.01
+    """EASI's release (method notes, section 6.2)."""
+    gradient_penalty: float | None = None
+    """Instead of, or beside, clipped weights (ours)."""
+    difference: bool = False
+    """Show the critic s' - s instead of s' (ours)."""
+    batch_per_robot: int = 16
+    """Transitions of every simulation in an update, and as many of the log in all (method notes, section 6.2)."""
+
+
+@dataclass(frozen=True)
+class Config:
+    name: str = "easi"
+    """Folder under ``runs``."""
+    runs: Path = Path("runs")
+    seed: int = 0
+    log: Path | None = None
+    """Robot log: .mcap, .csv or .npz."""
+    policy: Path | None = None
+    """Run or artifact folder of the BBC that made the log; the open-loop trot of ``record_log.py`` without one."""
+    behaviours: tuple[str, ...] = ("walk", "trot")
+    """What the BBC was told to do, as in ``record_log.py``."""
+    command_seconds: float = 1.0
+    """Time between two commands, as in ``record_log.py``."""
+    truth: Path | None = None
+    """``NAME.truth.json`` of a recorded log: print how far the search is from it. The search itself never sees it."""
+    generations: int = 50
+    """EASI's release (method notes, section 6.3)."""
+    num_robots: int = 300
+    """Individuals of a generation (Table S3)."""
+    trajectory_length: int = 500
+    """Control steps (Table S3)."""
+    noise: float = 0.0
+    """Measurement noise that the robot is known to have, as in ``record_log.py``."""
+    latency: int = 0
+    """Its known latency in control steps."""
+    friction_loss: float | None = None
+    """Dry friction of the joints [N m]; as the policy was trained when not given."""
+    num_threads: int | None = None
+    """Threads of the simulator; they do not change the result."""
+    max_minutes: float | None = None
+    """Stop and save after this time."""
+    checkpoint_every: int = 5
+    """Generations."""
+    resume: Path | None = None
+    """Run folder to go on with."""
+    search: SearchConfig = field(default_factory=SearchConfig)
+    critic: CriticConfig = field(default_factory=CriticConfig)
+
+
+PAPER = Config(search=SearchConfig(scale="linear", bounded=True))
+CPU = Config(trajectory_length=200, critic=CriticConfig(difference=True))
+SMOKE = replace(
+    CPU,
+    name="smoke",
+    generations=3,
+    num_robots=8,
+    trajectory_length=20,
+    checkpoint_every=1,
+    critic=replace(CPU.critic, updates=2, hidden=(16, 16)),
+)
+PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}
