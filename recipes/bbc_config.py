@@ -180,6 +180,7 @@ PAPER = Config(
 CPU = Config(
     iterations=1000,
     max_minutes=58.0,
+    motion=MotionConfig(standing_weight=0.0),
     env=EnvConfig(
         randomize=False,
         push_interval=None,
@@ -189,7 +190,7 @@ CPU = Config(
         episode_length=8.0,
         progress_weight=8.0,
         progress_fade=(120, 120),
-        progress_left=0.5,
+        progress_left=2.0,
         jump_weight=16.0,
         jump_width=0.03,
     ),
@@ -222,7 +223,7 @@ CPU = Config(
         prior_weight=2e-3,
         prior_temperature=100.0,
         imitation_reward=2.0,
-        skill_reward=2.0,
+        skill_reward=1.0,
         skill_floor=-15.0,
         task_reward=0.25,
         height_deviation=0.06,
