@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
-from torchrl.objectives import LossModule
 
 from agility_rl.keys import ESTIMATE, EXPLICIT, LATENT
+from agility_rl.losses.keyed import KeyedLoss
 
 
-class StateEstimationLoss(LossModule):
+class StateEstimationLoss(KeyedLoss):
     r"""Regress the state that the robot cannot measure: trunk height and linear velocity.
 
     .. math:: L = E \, \tfrac1n \| \hat s(o) - s \|^2
@@ -63,16 +63,7 @@ class StateEstimationLoss(LossModule):
         self._set_in_keys()
 
     def _set_in_keys(self) -> None:
-        self._in_keys: list[NestedKey] = [*self.estimator.in_keys, self.tensor_keys.target]
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries read."""
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+        self._in_keys = [*self.estimator.in_keys, self.tensor_keys.target]
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -88,7 +79,7 @@ class StateEstimationLoss(LossModule):
         return out
 
 
-class AdaptationLoss(LossModule):
+class AdaptationLoss(KeyedLoss):
     r"""Make the history encoder's latent and the privileged encoder's meet.
 
     .. math:: L = w_h \, E \| h(o_{t-9:t}) - \mathrm{sg}[z(p)] \| + w_p \, E \| z(p) - \mathrm{sg}[h(o_{t-9:t})] \|
@@ -166,16 +157,7 @@ class AdaptationLoss(LossModule):
         self._set_in_keys()
 
     def _set_in_keys(self) -> None:
-        self._in_keys: list[NestedKey] = [*self.history_encoder.in_keys, *self.privileged_encoder.in_keys]
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries read."""
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+        self._in_keys = [*self.history_encoder.in_keys, *self.privileged_encoder.in_keys]
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -5,18 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor, nn
-from torchrl.objectives import LossModule
 
 from agility_rl.keys import DISCRIMINATOR_LOGIT
-from agility_rl.losses.functional import CRITERIA, gradient_penalty
+from agility_rl.losses.functional import CRITERIA
+from agility_rl.losses.keyed import KeyedLoss, penalized_logit
 from agility_rl.losses.reduction import Reduction, check_reduction
 
 
-class DiscriminatorLoss(LossModule):
+class DiscriminatorLoss(KeyedLoss):
     r"""Teach a discriminator to tell expert motion from the policy's.
 
     .. math:: L = L_D + \lambda_{gp} \, E_E \|\nabla_o D(o)\|^2 + \lambda_l \|W_d\|^2 + \lambda_w \sum \|W\|^2
@@ -52,6 +51,7 @@ class DiscriminatorLoss(LossModule):
             without a submodule ``head``.
 
     Example:
+        >>> import torch
         >>> from agility_rl.modules import Discriminator
         >>> loss = DiscriminatorLoss(Discriminator(num_features=3, horizon=2, hidden=(8,)))
         >>> batch = TensorDict({
@@ -120,20 +120,11 @@ class DiscriminatorLoss(LossModule):
         self._set_in_keys()
 
     def _set_in_keys(self) -> None:
-        self._in_keys: list[NestedKey] = [
+        self._in_keys = [
             unravel_key((group, key))
             for group in (self.tensor_keys.expert, self.tensor_keys.policy)
             for key in self.discriminator.in_keys
         ]
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries read."""
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
 
     @property
     def out_keys(self) -> list[str]:
@@ -156,7 +147,7 @@ class DiscriminatorLoss(LossModule):
             if self.gradient_penalty is None:
                 expert_logit = network(expert).get(keys.logit)
             else:
-                expert_logit, penalty = self._penalized_logit(expert)
+                expert_logit, penalty = penalized_logit(network, expert, keys.logit, keys.penalty_input)
                 out.set("loss_gradient_penalty", self.gradient_penalty * self._reduce_loss(penalty, expert_group))
             policy_logit = network(policy).get(keys.logit)
         expert_term, policy_term = self.criterion(expert_logit, policy_logit)
@@ -170,24 +161,6 @@ class DiscriminatorLoss(LossModule):
         out.set("logit_policy", policy_logit.mean())
         self._clear_weakrefs(tensordict, out, "discriminator_params", "target_discriminator_params")
         return out
-
-    def _penalized_logit(self, expert: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Logit of the expert and its penalty ``[*B]``; works, without a graph, under ``torch.no_grad`` too."""
-        differentiable = torch.is_grad_enabled()
-        key = self.tensor_keys.penalty_input
-        with torch.enable_grad():
-            inputs = []
-            for name in self.discriminator.in_keys:
-                value = expert.get(name)
-                if value.is_floating_point():
-                    value = value.detach().requires_grad_()
-                    expert.set(name, value)
-                    inputs.append(value)
-            expert = self.discriminator(expert)
-            logit = expert.get(self.tensor_keys.logit)
-            penalized = expert.get(key, None)
-            penalty = gradient_penalty(logit, inputs if penalized is None else penalized, create_graph=differentiable)
-        return (logit, penalty) if differentiable else (logit.detach(), penalty)
 
     def _regularization(self) -> Tensor:
         squares = {key: self.discriminator_params.get(key).square().sum() for key in self._matrices}

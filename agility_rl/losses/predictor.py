@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModule, dispatch
 from torch.nn import functional
-from torchrl.objectives import LossModule
 
 from agility_rl.keys import SHIFT, SHIFT_ESTIMATE, SKILL, SKILL_LOGITS
 from agility_rl.losses.functional import conditional_entropy, marginal_entropy
+from agility_rl.losses.keyed import KeyedLoss
 from agility_rl.losses.reduction import Reduction, check_reduction
 
 
-class PredictorLoss(LossModule):
+class PredictorLoss(KeyedLoss):
     r"""Teach a predictor the skill from few labels and much unlabelled motion, and the shift from the policy.
 
     .. math:: L = w_{SS} \, \mathrm{CE}(Q^c(o_L), y) + w_{US} \, E_\pi |Q^\epsilon(o) - \epsilon|
@@ -129,16 +129,7 @@ class PredictorLoss(LossModule):
             groups.append((keys.policy, [*inputs, keys.shift]))
         if self._reads_unlabelled:
             groups.append((keys.unlabelled, inputs))
-        self._in_keys: list[NestedKey] = [unravel_key((group, key)) for group, entries in groups for key in entries]
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries read."""
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+        self._in_keys = [unravel_key((group, key)) for group, entries in groups for key in entries]
 
     @property
     def out_keys(self) -> list[str]:

@@ -8,14 +8,14 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor, nn
-from torchrl.objectives import LossModule
 
 from agility_rl.keys import TRANSITION_LOGIT
-from agility_rl.losses.functional import gradient_penalty, wasserstein
+from agility_rl.losses.functional import wasserstein
+from agility_rl.losses.keyed import KeyedLoss, penalized_logit
 from agility_rl.losses.reduction import Reduction, check_reduction
 
 
-class TransitionDiscriminatorLoss(LossModule):
+class TransitionDiscriminatorLoss(KeyedLoss):
     r"""Teach a discriminator to tell the robot's transitions from the simulator's.
 
     .. math:: L = \tfrac12 \left(-E_E \tilde D(s, a, s') + E_\pi \tilde D(s, a, s')\right)
@@ -111,20 +111,11 @@ class TransitionDiscriminatorLoss(LossModule):
         self._set_in_keys()
 
     def _set_in_keys(self) -> None:
-        self._in_keys: list[NestedKey] = [
+        self._in_keys = [
             unravel_key((group, key))
             for group in (self.tensor_keys.expert, self.tensor_keys.policy)
             for key in self.discriminator.in_keys
         ]
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries read."""
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
 
     @property
     def out_keys(self) -> list[str]:
@@ -172,17 +163,4 @@ class TransitionDiscriminatorLoss(LossModule):
         group = group.select(*self.discriminator.in_keys)
         if self.gradient_penalty is None:
             return self.discriminator(group).get(self.tensor_keys.logit), None
-        differentiable = torch.is_grad_enabled()
-        with torch.enable_grad():  # the penalty is a derivative, under torch.no_grad too
-            inputs = []
-            for name in self.discriminator.in_keys:
-                value = group.get(name)
-                if value.is_floating_point():
-                    value = value.detach().requires_grad_()
-                    group.set(name, value)
-                    inputs.append(value)
-            group = self.discriminator(group)
-            logit, normalized = group.get(self.tensor_keys.logit), group.get(self.tensor_keys.penalty_input, None)
-            at = inputs if normalized is None else normalized
-            penalty = gradient_penalty(logit, at, create_graph=differentiable)
-        return (logit, penalty) if differentiable else (logit.detach(), penalty)
+        return penalized_logit(self.discriminator, group, self.tensor_keys.logit, self.tensor_keys.penalty_input)
