@@ -9,7 +9,7 @@ import torch
 
 from agility_rl.go2 import constants, kinematics
 from agility_rl.motion import synthesize_gait
-from agility_rl.motion.clip import MotionClip, clip_from_joints
+from agility_rl.motion.clip import MotionClip, MotionError, clip_from_joints
 from agility_rl.motion.tracking import GRAVITY, foot_jacobian, joint_targets
 from agility_rl.simulation import make_simulator
 
@@ -74,3 +74,9 @@ def test_the_engine_stands_where_the_clip_does_when_the_load_is_compensated(
     sag = constants.STANDING_HEIGHT - float(simulator.root_position[0, 2])
     simulator.close()
     assert least <= abs(sag) <= most
+
+
+def test_frames_at_another_rate_are_refused() -> None:
+    clip = still(1.0)
+    with pytest.raises(MotionError, match=r"0\.04 s apart, expected 0\.02"):
+        joint_targets(clip_from_joints("slow", 0.04, clip.root_position, clip.root_quaternion, clip.joint_position))
