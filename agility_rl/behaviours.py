@@ -99,3 +99,23 @@ def sample_commands(skill: Tensor, generator: torch.Generator | None = None) -> 
     uniform = torch.rand((*skill.shape, len(COMMANDS)), generator=generator)
     command = low[skill] + (high - low)[skill] * uniform
     return command.masked_fill(command.abs() < torch.tensor(DEAD_BAND), 0.0)
+
+
+def command_vector(skill: Tensor, command: Tensor, shift: Tensor) -> Tensor:
+    """Command observation as networks read it: five commands, shift, one-hot skill.
+
+    Source: method notes, section 3.2.
+
+    Args:
+        skill: int64 ``[*B]``, index into :data:`BEHAVIOURS`.
+        command: ``[*B, 5]`` in the order and units of :data:`COMMANDS`.
+        shift: ``[*B, 1]`` in [-1, 1].
+
+    Returns:
+        ``[*B, 11]`` (:data:`agility_rl.keys.COMMAND`).
+
+    Example:
+        >>> command_vector(torch.tensor([1]), torch.zeros(1, 5), torch.ones(1, 1))[0].tolist()
+        [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    """
+    return torch.cat((command, shift, torch.nn.functional.one_hot(skill, NUM_BEHAVIOURS).to(command.dtype)), -1)

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torch.nn.functional import avg_pool1d, max_pool1d, mse_loss, one_hot, pad
+from torch.nn.functional import avg_pool1d, max_pool1d, mse_loss, pad
 
 from agility_rl import keys, rotations
-from agility_rl.behaviours import BEHAVIOURS, JUMP, NUM_BEHAVIOURS
+from agility_rl.behaviours import BEHAVIOURS, JUMP, NUM_BEHAVIOURS, command_vector
 from agility_rl.envs.locomotion import PEAK_WINDOW
 from agility_rl.go2 import constants, features
 from agility_rl.modules import BasicBehaviourController
@@ -47,7 +47,6 @@ def demonstration(clip: MotionClip, privileged: Tensor, generator: torch.Generat
     peak = _pool(height, leap, max_pool1d)
     command = torch.cat((wanted[:, :3], jumping * peak, (1.0 - jumping) * wanted[:, 3:]), -1)
     shift = 2.0 * torch.rand(frames, 1, generator=generator) - 1.0
-    skills = one_hot(torch.full((frames,), skill), NUM_BEHAVIOURS).float()
     past = max_pool1d(pad(height.T[None], (leap - 1, 0), mode="replicate"), leap, 1)[0].T
     explicit = features.explicit(height, velocity)
     return TensorDict(
@@ -63,7 +62,7 @@ def demonstration(clip: MotionClip, privileged: Tensor, generator: torch.Generat
             keys.EXPLICIT: explicit,
             keys.ESTIMATE: explicit,
             keys.PRIVILEGED: privileged.expand(frames, -1),
-            keys.COMMAND: torch.cat((command, shift, skills), -1),
+            keys.COMMAND: command_vector(torch.full((frames,), skill), command, shift),
             keys.PEAK: jumping * past,
             keys.ACTION: action,
         },

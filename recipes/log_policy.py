@@ -16,7 +16,7 @@ from rollouts import load_controller
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from agility_rl.behaviours import NUM_BEHAVIOURS, command_bounds, skill_index
+from agility_rl.behaviours import command_bounds, command_vector, skill_index
 from agility_rl.collectors import BehaviourPolicy
 from agility_rl.collectors.rollout import MeasuredPolicy
 from agility_rl.go2 import constants
@@ -87,8 +87,7 @@ def commands(behaviours: Sequence[str]) -> Tensor:
         for turn in (TURN, -TURN):
             command = (low[skill] + high[skill]) / 2
             command[2] = turn * high[skill, 2]
-            one_hot = torch.nn.functional.one_hot(torch.tensor(skill), NUM_BEHAVIOURS).float()
-            rows.append(torch.cat((command, torch.zeros(1), one_hot)))
+            rows.append(command_vector(torch.tensor(skill), command, torch.zeros(1)))
     return torch.stack(rows)
 
 

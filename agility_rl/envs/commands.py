@@ -76,8 +76,7 @@ class CommandSampler:
 
     def vector(self) -> Tensor:
         """Command observation ``[N, 11]``: five commands, shift, one-hot skill (:data:`agility_rl.keys.COMMAND`)."""
-        one_hot = torch.nn.functional.one_hot(self.skill, behaviours.NUM_BEHAVIOURS).float()
-        return torch.cat((self.command, self.shift, one_hot), -1)
+        return behaviours.command_vector(self.skill, self.command, self.shift)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything but the generator."""
