@@ -19,6 +19,8 @@ class MotionConfig:
     """Folder of unlabelled clips."""
     mirror: bool = True
     """Add the left-right mirrored motion."""
+    offsets: tuple[int, ...] = (0, 1)
+    """Frames that the discriminator sees together, in control steps from the oldest (Table S1: two consecutive)."""
     standing_weight: float = 0.1
     """Sampling weight of unlabelled frames in which the dog stands (1 = as recorded)."""
 
@@ -180,7 +182,7 @@ PAPER = Config(
 CPU = Config(
     iterations=1000,
     max_minutes=58.0,
-    motion=MotionConfig(standing_weight=0.0),
+    motion=MotionConfig(offsets=(0, 8, 16, 23, 24), standing_weight=0.0),
     env=EnvConfig(
         randomize=False,
         push_interval=None,

@@ -111,6 +111,7 @@ def build(cfg: Config) -> Components:
         observation_noise=cfg.env.observation_noise,
         push_interval=cfg.env.push_interval,
         episode_length=cfg.env.episode_length,
+        motion_offsets=cfg.motion.offsets,
         seed=seeds.integer("environment"),
     )
     bbc = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std)
@@ -122,6 +123,7 @@ def build(cfg: Config) -> Components:
     height = features.layout_slice(features.MOTION_LAYOUT, "root_height")
     deviation[height].clamp_(min=im.height_deviation)
     discriminator = Discriminator(
+        horizon=len(cfg.motion.offsets),
         hidden=im.hidden,
         normalizer=FeatureNormalizer(mean, deviation),
         num_skills=len(BEHAVIOURS) if im.conditional else None,
@@ -227,7 +229,9 @@ def load_motion(cfg: MotionConfig, seed: int) -> MotionDataset:
         labelled, unlabelled = synthetic_dataset_clips(seed)
     else:
         labelled, unlabelled = load_clips(cfg.labelled, label="from name"), load_clips(cfg.unlabelled)
-    return MotionDataset(labelled, unlabelled, mirror=cfg.mirror, standing_weight=cfg.standing_weight)
+    return MotionDataset(
+        labelled, unlabelled, offsets=cfg.offsets, mirror=cfg.mirror, standing_weight=cfg.standing_weight
+    )
 
 
 def save_policy(parts: Components, cfg: Config, folder: Path) -> None:

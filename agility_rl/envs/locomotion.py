@@ -13,9 +13,9 @@ from torchrl.envs import EnvBase
 
 from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.commands import CommandSampler
-from agility_rl.envs.observations import HISTORY, HORIZON, ObservationGroups
+from agility_rl.envs.observations import HISTORY, ObservationGroups
 from agility_rl.envs.randomization import NOMINAL, Randomization, sample_parameters
-from agility_rl.envs.reference import ReferenceStates
+from agility_rl.envs.reference import PAST, ReferenceStates
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm
 from agility_rl.envs.state import LocomotionState
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, Termination
@@ -70,11 +70,13 @@ class LocomotionEnv(EnvBase):
             :meth:`set_commands`.
         push_interval: seconds between pushes; ``None`` for none.
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
+        motion_offsets: which discriminator frames ``motion`` holds, in control steps from the oldest; ``[N, H, 49]``
+            then has their number H. With ``past_motion`` in the reference, those before an episode are the dog's.
         seed: seed of all randomness in the environment.
 
     Raises:
-        ValueError: if the simulator holds another number of robots, a reference entry is missing, or a behaviour has
-            no reference state.
+        ValueError: if the simulator holds another number of robots, a reference entry is missing or too short, a
+            behaviour has no reference state, or the offsets do not rise from zero.
 
     Example:
         >>> env = LocomotionEnv(2, simulator_options={"num_threads": 1})
@@ -99,6 +101,7 @@ class LocomotionEnv(EnvBase):
         resample_period: float | None = behaviours.RESAMPLE_PERIOD,
         push_interval: float | None = None,
         push_velocity: float = 0.5,
+        motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
         seed: int = 0,
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([num_robots]))
@@ -116,8 +119,9 @@ class LocomotionEnv(EnvBase):
         self.generator = torch.Generator().manual_seed(seed)
         period = None if resample_period is None else round(resample_period / self.dt)
         self.commands = CommandSampler(num_robots, self.generator, period)
-        self.observations = ObservationGroups(num_robots, self.generator, observation_noise)
+        self.observations = ObservationGroups(num_robots, self.generator, observation_noise, motion_offsets)
         self.reference = ReferenceStates.standing() if reference is None else ReferenceStates(reference)
+        self.reference.check_past(motion_offsets[-1])
         self._default_pose = torch.tensor(constants.DEFAULT_POSE)
         self._action_scale = torch.tensor(constants.ACTION_SCALE)
 
@@ -144,7 +148,7 @@ class LocomotionEnv(EnvBase):
                 keys.HISTORY: group(HISTORY, features.NUM_PROPRIOCEPTION),
                 keys.COMMAND: group(len(behaviours.COMMANDS) + 1 + behaviours.NUM_BEHAVIOURS),
                 keys.PEAK: group(1),
-                keys.MOTION: group(HORIZON, features.NUM_MOTION),
+                keys.MOTION: group(len(self.observations.motion_offsets), features.NUM_MOTION),
                 keys.SKILL: Categorical(behaviours.NUM_BEHAVIOURS, shape=(n,), dtype=torch.int64),
                 keys.SHIFT: Bounded(-1.0, 1.0, (n, 1), dtype=torch.float32),
                 keys.REWARD_TERMS: Composite({name: group(1) for name in self.rewards}, shape=(n,)),
@@ -188,7 +192,7 @@ class LocomotionEnv(EnvBase):
             mask = chosen.reshape(self.num_robots)
         if self.commands.period is not None:
             self.commands.resample(mask)
-        self._place(mask)
+        past = self._place(mask)
         if self.randomization is not None:
             self._randomize(mask)
         self._step_count = self._step_count.masked_fill(mask, 0)
@@ -202,7 +206,7 @@ class LocomotionEnv(EnvBase):
         self._heights = torch.where(row, self._height(), self._heights)
         state = self._state(self._action)
         self._torque = torch.where(row, state.torque, self._torque)
-        self.observations.reset(mask, state)
+        self.observations.reset(mask, state, past)
 
         observation = self.observations.build(state, self.commands, self._privileged)
         nothing = {name: torch.zeros(self.num_robots, 1) for name in self.rewards}
@@ -243,7 +247,7 @@ class LocomotionEnv(EnvBase):
         position = self.simulator.root_position
         return position[:, 2:] - self.simulator.ground_height(position[:, :2])[:, None]
 
-    def _place(self, mask: Tensor) -> None:
+    def _place(self, mask: Tensor) -> Tensor | None:
         n = self.num_robots
         start = self.reference.sample(self.commands.skill, self.generator)
         yaw = 2.0 * torch.pi * torch.rand(n, generator=self.generator)
@@ -259,6 +263,7 @@ class LocomotionEnv(EnvBase):
             joint_position=start["joint_position"],
             joint_velocity=start["joint_velocity"],
         )
+        return start.get(PAST, None)
 
     def _randomize(self, mask: Tensor) -> None:
         assert self.randomization is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -15,8 +16,6 @@ from agility_rl.go2 import features
 
 HISTORY = 10
 """Frames of proprioception history (released code)."""
-HORIZON = 2
-"""Consecutive discriminator frames (Table S1)."""
 FOOT_CONTACT_FORCE = 2.0
 """Force on a foot that counts as contact [N], now or one step earlier (released code)."""
 OBSERVATION_LIMIT = 100.0
@@ -34,22 +33,40 @@ class ObservationGroups:
         num_robots: N.
         generator: source of the noise.
         noise: factor on the half-widths of :data:`agility_rl.go2.features.PROPRIOCEPTION_LAYOUT`.
+        motion_offsets: which frames ``motion`` holds, in control steps from the oldest.
     """
 
-    def __init__(self, num_robots: int, generator: torch.Generator, noise: float = 0.0) -> None:
+    def __init__(
+        self,
+        num_robots: int,
+        generator: torch.Generator,
+        noise: float = 0.0,
+        motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
+    ) -> None:
         self.generator = generator
         self.noise = noise * features.noise_scale(features.PROPRIOCEPTION_LAYOUT) if noise else None
         self.history = torch.zeros(num_robots, HISTORY, features.NUM_PROPRIOCEPTION)
-        self.motion = torch.zeros(num_robots, HORIZON, features.NUM_MOTION)
+        features.check_motion_offsets(motion_offsets)
+        self.motion_offsets = torch.tensor(motion_offsets)
+        self.motion = torch.zeros(num_robots, motion_offsets[-1] + 1, features.NUM_MOTION)
         self.touched = torch.zeros(num_robots, 4, dtype=torch.bool)
 
-    def reset(self, mask: Tensor, state: LocomotionState) -> None:
-        """Fill the memories of the rows of a bool mask ``[N]`` with copies of the present."""
+    def reset(self, mask: Tensor, state: LocomotionState, past: Tensor | None = None) -> None:
+        """Fill the memories of the rows of a bool mask ``[N]`` with copies of the present.
+
+        Args:
+            mask: the rows.
+            state: the present.
+            past: ``[N, span, 49]``, frames of the recorded motion that led here, for discriminators that look back.
+        """
         touched = state.foot_contact > FOOT_CONTACT_FORCE
         row = mask[:, None]
         self.touched = torch.where(row, touched, self.touched)
         self.history = torch.where(row[..., None], self._measure(state, touched)[:, None], self.history)
-        self.motion = torch.where(row[..., None], _motion_frame(state)[:, None], self.motion)
+        motion = _motion_frame(state)[:, None]
+        if past is not None:
+            motion = torch.cat((past, motion), 1)
+        self.motion = torch.where(row[..., None], motion, self.motion)
 
     def update(self, state: LocomotionState) -> None:
         """Append the present to the memories of every robot."""
@@ -69,7 +86,7 @@ class ObservationGroups:
                 keys.HISTORY: self.history,
                 keys.COMMAND: commands.vector(),
                 keys.PEAK: (state.peak_height * commands.jumping)[:, None],
-                keys.MOTION: self.motion,
+                keys.MOTION: self.motion[:, self.motion_offsets],
                 keys.SKILL: commands.skill,
                 keys.SHIFT: commands.shift,
             },

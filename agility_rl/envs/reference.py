@@ -17,6 +17,8 @@ STATE_ENTRIES = (
     "joint_position",
     "joint_velocity",
 )
+PAST = "past_motion"
+"""Discriminator frames before the state, oldest first."""
 
 
 class ReferenceStates:
@@ -27,7 +29,7 @@ class ReferenceStates:
     Args:
         states: TensorDict ``[M]`` with ``skill`` int64, ``root_height`` [M, 1] [m], ``root_quaternion`` [M, 4],
             ``root_linear_velocity``, ``root_angular_velocity`` [M, 3] (world frame), ``joint_position``,
-            ``joint_velocity`` [M, 12].
+            ``joint_velocity`` [M, 12]; optionally ``past_motion`` [M, span, 49], the discriminator frames before.
 
     Raises:
         ValueError: if an entry is missing or a behaviour has no state.
@@ -47,7 +49,20 @@ class ReferenceStates:
         if empty:
             raise ValueError(f"no reference state for {', '.join(empty)}; give at least one for each behaviour")
         self.first = torch.cumsum(self.count, 0) - self.count
-        self.states = states.select(*STATE_ENTRIES)[torch.argsort(states["skill"], stable=True)]
+        self.states = states.select(*STATE_ENTRIES, PAST, strict=False)[torch.argsort(states["skill"], stable=True)]
+
+    def check_past(self, span: int) -> None:
+        """Refuse states whose past is not of ``span`` frames; states without a past are welcome.
+
+        Raises:
+            ValueError: if it is of another length.
+        """
+        past = self.states.get(PAST, None)
+        if past is not None and past.shape[1] != span:
+            raise ValueError(
+                f"the reference states bring {past.shape[1]} past motion frames, expected {span}; "
+                "give dataset and environment the same motion offsets"
+            )
 
     @classmethod
     def standing(cls) -> ReferenceStates:

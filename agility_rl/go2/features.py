@@ -8,6 +8,8 @@ proprioception are left out, which makes 45 numbers of its 57.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -72,6 +74,23 @@ NUM_PROPRIOCEPTION = sum(entry.size for entry in PROPRIOCEPTION_LAYOUT)
 NUM_EXPLICIT = sum(entry.size for entry in EXPLICIT_LAYOUT)
 NUM_MOTION = sum(entry.size for entry in MOTION_LAYOUT)
 NUM_MEASUREMENT = sum(entry.size for entry in MEASUREMENT_LAYOUT)
+
+
+MOTION_OFFSETS = (0, 1)
+"""Frames that a discriminator sees together, in control steps from the oldest: two consecutive ones (Table S1)."""
+
+
+def check_motion_offsets(offsets: Sequence[int]) -> None:
+    """Refuse offsets of discriminator frames that do not rise from zero.
+
+    Raises:
+        ValueError: if they do not.
+
+    Example:
+        >>> check_motion_offsets((0, 8, 16))
+    """
+    if not offsets or offsets[0] != 0 or any(later <= earlier for earlier, later in pairwise(offsets)):
+        raise ValueError(f"expected offsets of motion frames that rise from 0, such as (0, 1), got {tuple(offsets)}")
 
 
 def layout_slice(layout: tuple[Entry, ...], name: str) -> slice:

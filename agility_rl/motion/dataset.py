@@ -54,6 +54,7 @@ class _Pool(NamedTuple):
     starts: Tensor  # int64 [S], index into frames
     weights: Tensor  # float64 [S]
     groups: Tensor  # int64 [S], skill of each start, non-decreasing
+    clips: Tensor  # int64 [S], first frame of the clip of each start
 
 
 class MotionDataset:
@@ -68,7 +69,7 @@ class MotionDataset:
         labelled: clips with a label.
         unlabelled: clips whose labels, if any, are ignored.
         dt: seconds between two frames of a sample [s]; clips of another rate are resampled.
-        horizon: consecutive frames a sample holds.
+        offsets: which frames a sample holds, in frames from its first.
         mirror: also draw from the mirror image of every clip, each with half its weight.
         features: maps a clip to the features of its frames.
         standing_weight: factor on the weight of unlabelled frames in which the dog stands, which a dog does a third of
@@ -95,7 +96,7 @@ class MotionDataset:
         labelled: Sequence[MotionClip],
         unlabelled: Sequence[MotionClip],
         dt: float = CONTROL_DT,
-        horizon: int = 2,
+        offsets: Sequence[int] = go2_features.MOTION_OFFSETS,
         mirror: bool = False,
         features: FrameFeatures = discriminator_frames,
         standing_weight: float = 1.0,
@@ -110,8 +111,9 @@ class MotionDataset:
                     f"clip {clip.name!r}: label {clip.label!r} is no behaviour; expected one of {', '.join(BEHAVIOURS)}"
                 )
         self.dt = dt
-        self.horizon = horizon
-        self._offsets = torch.arange(horizon)
+        go2_features.check_motion_offsets(offsets)
+        self.span = offsets[-1]
+        self._offsets = torch.tensor(offsets)
         labelled = sorted((resample(clip, dt) for clip in labelled), key=lambda clip: BEHAVIOURS.index(str(clip.label)))
         unlabelled = [resample(clip, dt) for clip in unlabelled]
         self._class_seconds = {
@@ -142,7 +144,7 @@ class MotionDataset:
             generator: source of randomness.
 
         Returns:
-            ``motion`` float32 ``[n, horizon, F]``.
+            ``motion`` float32 ``[n, H, F]``.
         """
         pool = self._unlabelled
         if self._uniform:
@@ -162,7 +164,7 @@ class MotionDataset:
             skill_probabilities: ``[5]`` share of each class; classes without clips get none. None: equal shares.
 
         Returns:
-            ``motion`` float32 ``[n, horizon, F]`` and ``skill`` int64 ``[n]``.
+            ``motion`` float32 ``[n, H, F]`` and ``skill`` int64 ``[n]``.
 
         Raises:
             MotionError: if no class with clips has a positive share.
@@ -186,7 +188,8 @@ class MotionDataset:
         Returns:
             ``root_height`` ``[n, 1]`` [m] over the ground, ``root_quaternion`` ``[n, 4]``, ``root_linear_velocity``
             ``[n, 3]`` [m/s] and ``root_angular_velocity`` ``[n, 3]`` [rad/s] in the world frame, ``joint_position``
-            ``[n, 12]`` [rad] and ``joint_velocity`` ``[n, 12]`` [rad/s].
+            ``[n, 12]`` [rad], ``joint_velocity`` ``[n, 12]`` [rad/s], and ``past_motion`` ``[n, span, F]``: the frames
+            before, of which a sample's oldest is ``span`` frames old; before a clip's first frame stands that frame.
 
         Raises:
             MotionError: if a skill has no labelled clip.
@@ -196,10 +199,11 @@ class MotionDataset:
             raise MotionError(
                 f"expected labelled clips of {BEHAVIOURS[int(absent[0])]!r} to start from, there are none"
             )
-        index = self._labelled.starts[_draw(self._labelled_table, skill, generator)]
-        return TensorDict(
-            {name: value.index_select(0, index) for name, value in self._states.items()}, batch_size=[len(skill)]
-        )
+        pool, pick = self._labelled, _draw(self._labelled_table, skill, generator)
+        index = pool.starts[pick] + torch.randint(self.span + 1, pick.shape, generator=generator)
+        before = torch.maximum(index[:, None] + torch.arange(-self.span, 0), pool.clips[pick][:, None])
+        states = {name: value.index_select(0, index) for name, value in self._states.items()}
+        return TensorDict(states | {"past_motion": pool.frames[before]}, batch_size=[len(skill)])
 
     def statistics(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation ``[F]`` of the unlabelled frames; deviations below 1e-3 are raised to that."""
@@ -220,22 +224,23 @@ class MotionDataset:
         return labelled / (labelled + self._unlabelled_seconds)
 
     def _pool(self, clips: Sequence[MotionClip], groups: Sequence[int], features: FrameFeatures) -> _Pool:
-        frames, starts, weights, members, total = [], [], [], [], 0
+        frames, starts, weights, members, firsts, total = [], [], [], [], [], 0
         for clip, group in zip(clips, groups, strict=True):
-            count = clip.num_frames - self.horizon + 1
+            count = clip.num_frames - self.span
             if count < 1:
                 raise MotionError(
-                    f"clip {clip.name!r}: {clip.num_frames} frames, expected at least the {self.horizon} of a sample"
+                    f"clip {clip.name!r}: {clip.num_frames} frames, expected at least the {self.span + 1} of a sample"
                 )
             frames.append(features(clip))
             starts.append(torch.arange(total, total + count))
             weights.append(torch.full((count,), clip.weight, dtype=torch.float64))
             members.append(torch.full((count,), group))
+            firsts.append(torch.full((count,), total))
             total += clip.num_frames
         if not clips:
             empty = torch.zeros(0, dtype=torch.int64)
-            return _Pool(torch.zeros(0), empty, empty.double(), empty)
-        return _Pool(torch.cat(frames), torch.cat(starts), torch.cat(weights), torch.cat(members))
+            return _Pool(torch.zeros(0), empty, empty.double(), empty, empty)
+        return _Pool(*(torch.cat(parts) for parts in (frames, starts, weights, members, firsts)))
 
     def _gather(self, pool: _Pool, pick: Tensor) -> Tensor:
         # index_select over a flat index is several times faster than indexing with a matrix.

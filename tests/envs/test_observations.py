@@ -12,6 +12,7 @@ from agility_rl import keys
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.observations import ObservationGroups
+from agility_rl.envs.reference import ReferenceStates
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import features
 
@@ -110,6 +111,32 @@ def test_history_and_motion_slide_over_time(build: Build) -> None:
         frames.append(carrier[keys.MOTION][:, -1])
         assert torch.equal(carrier[keys.HISTORY], torch.stack(measured[-10:], 1))
         assert torch.equal(carrier[keys.MOTION], torch.stack(frames[-2:], 1))
+
+
+def test_motion_frames_far_apart(build: Build) -> None:
+    dense, sparse = build(3, motion_offsets=range(7)), build(3, motion_offsets=(0, 2, 5, 6))
+    carriers = [env.reset() for env in (dense, sparse)]
+    for action in actions(9, 3):
+        carriers = [
+            env.step_and_maybe_reset(carrier.set(keys.ACTION, action))[1]
+            for env, carrier in zip((dense, sparse), carriers, strict=True)
+        ]
+        assert torch.equal(carriers[0][keys.MOTION][:, [0, 2, 5, 6]], carriers[1][keys.MOTION])
+
+
+def test_before_an_episode_stand_the_frames_of_the_reference(build: Build) -> None:
+    reference = ReferenceStates.standing().states.clone()
+    reference["skill"] = torch.arange(5)
+    reference["past_motion"] = torch.arange(5.0)[:, None, None].expand(5, 3, 49) + torch.tensor([[0.1], [0.2], [0.3]])
+    env = build(4, reference=reference, motion_offsets=(0, 1, 3))
+    carrier = env.reset()
+    skill = carrier[keys.SKILL].float()
+    now = carrier[keys.MOTION][:, 2]
+    assert torch.equal(carrier[keys.MOTION][:, :2, 0], skill[:, None] + torch.tensor([0.1, 0.2]))
+    carrier = env.step(carrier.set(keys.ACTION, torch.zeros(4, 12)))["next"]
+    assert torch.equal(carrier[keys.MOTION][:, :2, 0], skill[:, None] + torch.tensor([0.2, 0.3]))
+    carrier = env.step(carrier.set(keys.ACTION, torch.zeros(4, 12)))["next"]
+    assert torch.equal(carrier[keys.MOTION][:, 1], now)
 
 
 def test_earlier_observations_stay_as_they_were(build: Build) -> None:

@@ -26,6 +26,12 @@ def test_slices_are_contiguous_and_unknown_names_are_refused() -> None:
         features.layout_slice(features.MOTION_LAYOUT, "tail")
 
 
+@pytest.mark.parametrize("offsets", [(), (1, 2), (0, 3, 3), (0, -1)])
+def test_offsets_rise_from_zero(offsets: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="rise from 0"):
+        features.check_motion_offsets(offsets)
+
+
 def test_noise_is_scaled_like_its_entry() -> None:
     noise = features.noise_scale(features.PROPRIOCEPTION_LAYOUT)
     assert noise[2].item() == pytest.approx(0.2 * 0.25)

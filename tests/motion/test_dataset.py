@@ -52,8 +52,18 @@ def test_samples_are_consecutive_frames_of_one_clip(dataset: MotionDataset, gene
 
 
 def test_longer_horizons(clips: dict[str, MotionClip], generator: torch.Generator) -> None:
-    motion = MotionDataset([], [clips["free"]], horizon=5, features=tag_and_frame).sample_unlabelled(50, generator)
+    motion = MotionDataset([], [clips["free"]], offsets=range(5), features=tag_and_frame).sample_unlabelled(50, generator)
     assert torch.equal(motion["motion"][:, :, 1].diff(dim=1), torch.ones(50, 4))
+
+
+def test_frames_far_apart(clips: dict[str, MotionClip], generator: torch.Generator) -> None:
+    dataset = MotionDataset([clips["trot"]], [clips["free"]], offsets=(0, 7, 20), features=tag_and_frame)
+    for batch in (dataset.sample_unlabelled(500, generator), dataset.sample_labelled(500, generator)):
+        frames = batch["motion"][..., 1]
+        assert torch.equal(frames - frames[:, :1], torch.tensor([0.0, 7.0, 20.0]).expand(500, 3))
+    assert frames[:, 0].max() == 20  # of the 41 frames of the trot
+    with pytest.raises(ValueError, match=r"rise from 0, such as \(0, 1\), got \(0, 5, 5\)"):
+        MotionDataset([], [clips["free"]], offsets=(0, 5, 5))
 
 
 def test_unlabelled_motion_is_drawn_by_time(dataset: MotionDataset, generator: torch.Generator) -> None:
@@ -109,9 +119,22 @@ def test_states_come_from_the_asked_skill(dataset: MotionDataset, generator: tor
         "root_angular_velocity": (5, 3),
         "joint_position": (5, 12),
         "joint_velocity": (5, 12),
+        "past_motion": (5, 1, 2),
     }
     with pytest.raises(MotionError, match="labelled clips of 'jump' to start from"):
         dataset.sample_states(torch.tensor([0, 4]), generator)
+
+
+def test_states_bring_the_frames_before_them(clips: dict[str, MotionClip], generator: torch.Generator) -> None:
+    walk = clips["walk"]  # its height counts its frames, so that a state tells which frame it is
+    walk = replace(walk, root_position=torch.arange(11.0)[:, None].expand(11, 3))
+    dataset = MotionDataset([clips["trot"], walk], [walk], offsets=(0, 1, 4), features=tag_and_frame)
+    states = dataset.sample_states(torch.zeros(400, dtype=torch.int64), generator)
+    now = states["root_height"]
+    assert sorted(now.unique().tolist()) == list(range(11))
+    before = now + torch.arange(-4.0, 0.0)
+    assert torch.equal(states["past_motion"][..., 1], before.clamp(min=0.0))  # the clip's first frame before the clip
+    assert (states["past_motion"][..., 0] == 1.0).all()  # never another clip's
 
 
 def test_equal_generators_draw_equal_samples(dataset: MotionDataset) -> None:
@@ -172,7 +195,7 @@ def test_unusable_sets_are_refused(make_clip: ClipMaker, clips: dict[str, Motion
     with pytest.raises(MotionError, match="label 'gallop' is no behaviour"):
         MotionDataset([make_clip(label="gallop")], [clips["free"]])
     with pytest.raises(MotionError, match="3 frames, expected at least the 5 of a sample"):
-        MotionDataset([], [clips["free2"]], horizon=5)
+        MotionDataset([], [clips["free2"]], offsets=range(5))
     with pytest.raises(MotionError, match="positive weight"):
         MotionDataset([], [replace(clips["free"], weight=0.0)])
 
