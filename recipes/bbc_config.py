@@ -57,6 +57,8 @@ class EnvConfig:
     """Contact of a thigh ends the episode too, as in stage 3."""
     friction_loss: float = 0.2
     """Dry friction of the joints [N m]; 0 as in the released simulation is a tenth faster."""
+    simulator: Path | None = None
+    """Identified simulator to train in: ``result.json`` of ``easi.py``. It takes the place of the randomisation."""
     num_threads: int | None = None
 
 
@@ -83,6 +85,8 @@ class PPOConfig:
     min_std: float = 0.1
     hidden: tuple[int, ...] = (512, 256, 128)
     """Supplement S6."""
+    critic_warm_up: int = 0
+    """First iterations that leave the policy as it is: a fresh critic would mislead one that is already good."""
     critic_history: bool = True
     """The critic reads the history too (released code)."""
 

@@ -225,7 +225,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
             loss = parts.adaptation_loss(sample)["loss_privileged"] if weight > 0.0 else torch.zeros(())
             return loss + kept * parts.demonstrations.error(parts.bbc) if kept > 0.0 else loss
 
-        metrics |= parts.ppo(batch, parts.generator, extra)
+        metrics |= parts.ppo(batch, parts.generator, extra, critic_only=iteration < cfg.ppo.critic_warm_up)
     lap("policy")
     metrics |= update_adaptation(parts, cfg.adaptation.minibatches, batch)
     lap("adaptation")

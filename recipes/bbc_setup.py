@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from bbc_cloning import Demonstrations
 from bbc_config import Config, MotionConfig
+from identified import load_simulator
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -97,17 +99,22 @@ def build(cfg: Config) -> Components:
     terms["collision"] = terms["collision"]._replace(weight=cfg.env.collision_weight)
     skills = torch.arange(len(BEHAVIOURS)).repeat_interleave(2000)
     reference = dataset.sample_states(skills, seeds.generator("reference"))
+    randomization = Randomization() if cfg.env.randomize else NOMINAL if cfg.env.action_delay else None
+    model: dict[str, Any] = {"friction_loss": cfg.env.friction_loss}
+    if cfg.env.simulator is not None:
+        simulator = load_simulator(cfg.env.simulator)
+        randomization, model = simulator.randomization, model | dict(simulator.model)
     env = LocomotionEnv(
         cfg.env.num_robots,
         simulator_options={
             "num_threads": cfg.env.num_threads,
-            "friction_loss": cfg.env.friction_loss,
+            **model,
             "terrain": rough_pyramids(seeds.generator("terrain")) if cfg.env.terrain == "rough" else None,
         },
         reference=reference.set("skill", skills),
         rewards=terms,
         terminations=(*LOCOMOTION_TERMINATIONS, *([thigh_contact] if cfg.env.end_when_sitting else [])),
-        randomization=Randomization() if cfg.env.randomize else NOMINAL if cfg.env.action_delay else None,
+        randomization=randomization,
         observation_noise=cfg.env.observation_noise,
         push_interval=cfg.env.push_interval,
         episode_length=cfg.env.episode_length,

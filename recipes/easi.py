@@ -228,7 +228,8 @@ def train(cfg: Config, console: Console | None = None) -> Path:
     if parts.search.generation:
         found = identify(parts.search, parts.space, parts.survivors / parts.search.generation)
         print_result(console, parts.search, parts.space, found, parts.truth)
-        write_result(folder, parts.search, parts.space, found, parts.truth)
+        model = {"friction_loss": parts.inputs["friction_loss"]}
+        write_result(folder, parts.search, parts.space, found, parts.truth, model)
         draw_convergence(folder / "figures" / "convergence.png", read_scalars(folder), parts.space, parts.truth)
     console.print(f"saved {folder}", markup=False)
     return folder

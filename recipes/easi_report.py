@@ -136,9 +136,14 @@ def load_truth(path: Path, space: ParameterSpace) -> tuple[Tensor, dict[str, Any
 
 
 def write_result(
-    folder: Path, search: EvolutionStrategy, space: ParameterSpace, found: Identifiability, truth: Tensor | None
+    folder: Path,
+    search: EvolutionStrategy,
+    space: ParameterSpace,
+    found: Identifiability,
+    truth: Tensor | None,
+    model: Mapping[str, Any],
 ) -> Path:
-    """Write ``result.json``: physical values and multiples for people, search coordinates for the next stage."""
+    """Write ``result.json``: values and multiples for people, search coordinates and model for the next stage."""
     centre, deviation = physical(search, space)
     error = None if truth is None else relative_error(centre, truth, space)
     parameters: dict[str, Any] = {}
@@ -161,6 +166,7 @@ def write_result(
         "chance_spread": found.chance,
         "correlation": found.correlation.tolist(),
         "warnings": found.warnings,
+        "model": model,
         # What a later stage draws simulators from: a Gaussian in these coordinates, mapped by these ranges.
         "search": {
             "mean": search.mean.tolist(),

@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 import torch
 import tyro
+from identified import load_simulator
 from judgement import draw_episode, nmi_interval, print_evaluation, targets, to_json
 from rich.console import Console
 from rollouts import Controller, Motion, MotionConfig, Recording, join, load_controller, load_motion, make_env, record
@@ -72,6 +73,8 @@ class Config:
     """Time in the first and in the second behaviour."""
     robots: int = 500
     """Most robots simulated at once."""
+    simulator: Path | None = None
+    """Another simulator than the nominal one: ``result.json`` of ``easi.py``, or a log's ``NAME.truth.json``."""
     randomize: bool = False
     """Draw friction, masses and gains as in training instead of the nominal robot."""
     noise: float = 0.0
@@ -90,10 +93,11 @@ def simulate(
 ) -> Recording:
     """Record all robots of a schedule, at most ``config.robots`` at once."""
     parts: list[Recording] = []
+    simulator = load_simulator(config.simulator) if config.simulator else None
     for rows in torch.arange(len(schedule[0][1])).split(config.robots):
         randomization = Randomization() if config.randomize else None
         options = {"num_threads": config.num_threads, "observation_noise": config.noise, "randomization": randomization}
-        env = make_env(len(rows), controller, reference, seed=config.seed + len(parts), **options)
+        env = make_env(len(rows), controller, reference, simulator, seed=config.seed + len(parts), **options)
         parts.append(record(controller.bbc, env, [(steps, skill[rows], c[rows]) for steps, skill, c in schedule]))
         env.close()
     return join(parts)

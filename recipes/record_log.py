@@ -18,6 +18,7 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from log_policy import make_actor
@@ -75,6 +76,10 @@ class Config:
     """Control steps by which measurements are late."""
     friction_loss: float | None = None
     """Dry friction of the joints before ``--truth.friction-loss`` [N m]; as the policy was trained when not given."""
+    contact_time: float = 0.02
+    """Time constant of contacts with the ground [s]; another than the search's is a mismatch it cannot express."""
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal"
+    """Friction cone of the engine; likewise."""
     seed: int = 0
     """Of the draw and the noise."""
 
@@ -120,7 +125,8 @@ def main(cfg: Config) -> Path:
     truth = parameters(cfg, seeds.generator("truth"))
     actor = make_actor(cfg.policy, cfg.behaviours, cfg.command_seconds)
     friction = actor.friction_loss if cfg.friction_loss is None else cfg.friction_loss
-    simulator = make_simulator(num_simulations=1, num_threads=1, friction_loss=friction)
+    model: dict[str, Any] = {"friction_loss": friction, "contact_time": cfg.contact_time, "cone": cfg.cone}
+    simulator = make_simulator(num_simulations=1, num_threads=1, **model)
     space = ParameterSpace(tuple(truth))
     values = torch.tensor([[entry["value"] for entry in truth.values()]], dtype=torch.float64)
     simulator.set_parameters(torch.ones(1, dtype=torch.bool), **space.fields(values))
@@ -141,6 +147,7 @@ def main(cfg: Config) -> Path:
         "friction_loss": friction,
         "noise": cfg.noise,
         "latency": cfg.latency,
+        "model": model,
     }
     record = {"parameters": truth, "recording": recording, "config": cfg, "versions": cli.versions()}
     cli.write_json(truth_file, cli.to_json(record))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from identified import SimulatorFile
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -122,12 +123,24 @@ def load_motion(config: MotionConfig, trained: Mapping[str, Any], seed: int) -> 
     return Motion(load_clips(labelled, label="from name"), rest, "/".join(labelled.resolve().parts[-2:]), False)
 
 
-def make_env(num_robots: int, controller: Controller, reference: TensorDictBase, **options: Any) -> LocomotionEnv:
-    """Robots whose commands only the caller changes and whose episodes only a fall ends."""
-    threads = options.pop("num_threads", None)
+def make_env(
+    num_robots: int,
+    controller: Controller,
+    reference: TensorDictBase,
+    simulator: SimulatorFile | None = None,
+    **options: Any,
+) -> LocomotionEnv:
+    """Robots whose commands only the caller changes and whose episodes only a fall ends.
+
+    They live in the simulator that is given, else in a nominal one with the friction of the training.
+    """
+    model = {"num_threads": options.pop("num_threads", None), "friction_loss": controller.friction_loss}
+    if simulator is not None:
+        model |= simulator.model
+        options["randomization"] = simulator.randomization
     return LocomotionEnv(
         num_robots,
-        simulator_options={"num_threads": threads, "friction_loss": controller.friction_loss},
+        simulator_options=model,
         reference=reference,
         episode_length=1e6,
         resample_period=None,

@@ -6,6 +6,7 @@ gain multipliers 0.8 to 1.2 per joint.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -27,6 +28,9 @@ class Randomization:
     """Multipliers of stiffness and damping, per joint."""
     action_delay: tuple[float, float] = (0.0, 0.0)
     """Seconds between a target and its arrival at the motors."""
+    draw: Callable[[int, torch.Generator], dict[str, Tensor]] | None = None
+    """Further fields for ``Simulator.set_parameters`` of a number of robots, in place of those above: an identified
+    simulator (stage 2)."""
 
 
 NOMINAL = Randomization((1.0, 1.0), (0.0, 0.0), (0.0, 0.0), (1.0, 1.0), (0.0, 0.0))
@@ -61,17 +65,18 @@ def sample_parameters(
     friction = uniform((num_robots, 1), ranges.friction, generator)
     mass = uniform((num_robots, 1), ranges.trunk_mass, generator)
     com = uniform((num_robots, 3), ranges.trunk_com, generator)
-    stiffness = uniform((num_robots, 12), ranges.gain, generator)
-    damping = uniform((num_robots, 12), ranges.gain, generator)
-    delay = uniform((num_robots, 1), ranges.action_delay, generator)
     fields = {
         "ground_friction": friction,
         "trunk_mass_offset": mass,
         "trunk_com_offset": com,
-        "stiffness": stiffness * constants.STIFFNESS,
-        "damping": damping * constants.DAMPING,
-        "action_delay": delay,
+        "stiffness": uniform((num_robots, 12), ranges.gain, generator) * constants.STIFFNESS,
+        "damping": uniform((num_robots, 12), ranges.gain, generator) * constants.DAMPING,
+        "action_delay": uniform((num_robots, 1), ranges.action_delay, generator),
     }
-    if not torch.count_nonzero(delay):
+    if not torch.count_nonzero(fields["action_delay"]):
         del fields["action_delay"]
-    return fields, torch.cat((mass, com, friction, stiffness - 1.0, damping - 1.0), -1)
+    if ranges.draw is not None:
+        fields |= ranges.draw(num_robots, generator)
+    known = ("trunk_mass_offset", "trunk_com_offset", "ground_friction")
+    gains = fields["stiffness"] / constants.STIFFNESS - 1.0, fields["damping"] / constants.DAMPING - 1.0
+    return fields, torch.cat((*(fields[name] for name in known), *gains), -1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -34,6 +34,9 @@ _THIGH_FRAME = {"L": (0.829533, 0.0847635, -0.0200632, 0.551623), "R": (0.551623
 _CALF_FRAME = {"L": (0.710672, 0.00154099, -0.00450087, 0.703508), "R": (0.703508, -0.00450087, 0.00154099, 0.710672)}
 
 
+_CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+
+
 def build_spec(
     *,
     sim_dt: float = constants.SIM_DT,
@@ -44,6 +47,8 @@ def build_spec(
     friction_loss: float = constants.FRICTION_LOSS,
     torque_limit: Sequence[float] = constants.TORQUE_LIMIT,
     ground_friction: float = 1.0,
+    contact_time: float = 0.02,
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal",
     self_collision: bool = False,
     heights: np.ndarray | None = None,
     height_field_size: tuple[float, float] = (10.0, 10.0),
@@ -68,6 +73,8 @@ def build_spec(
         friction_loss: dry friction [N m].
         torque_limit: twelve limits [N m].
         ground_friction: sliding friction coefficient.
+        contact_time: time constant of contacts with the ground [s]: the engine's 0.02, larger is softer.
+        cone: shape of the friction cone.
         self_collision: let the robot's own links collide with each other.
         heights: height field [rows (y), columns (x)] in metres instead of a plane.
         height_field_size: half sizes of the height field in x and y [m].
@@ -76,7 +83,8 @@ def build_spec(
         skin: folder with the Menagerie's meshes (``base_0.obj`` ...), for looks only.
 
     Raises:
-        ValueError: if a list does not have twelve entries or ``skin`` lacks a mesh.
+        ValueError: if a list does not have twelve entries, ``skin`` lacks a mesh, there is no such ``cone``, or
+            ``contact_time`` is too short for ``sim_dt``.
 
     Example:
         >>> model = build_spec().compile()
@@ -89,11 +97,15 @@ def build_spec(
     spec.compiler.degree = False
     spec.option.timestep = sim_dt
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    if cone not in _CONES:
+        raise ValueError(f"cone must be one of {', '.join(_CONES)}, got {cone!r}")
+    if contact_time < 2.0 * sim_dt:
+        raise ValueError(f"contact_time must be at least twice sim_dt, {2.0 * sim_dt} s, got {contact_time}")
+    spec.option.cone = _CONES[cone]
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE  # MuJoCo 4.0.0 has a bug with sparse ones
     spec.option.iterations = iterations
     spec.option.ls_iterations = ls_iterations
-    _add_ground(spec, ground_friction, heights, height_field_size)
+    _add_ground(spec, ground_friction, contact_time, heights, height_field_size)
 
     trunk = spec.worldbody.add_body(name="trunk", pos=(0.0, 0.0, constants.STANDING_HEIGHT))
     trunk.add_freejoint(name="root")
@@ -120,9 +132,11 @@ def build_spec(
     return spec
 
 
-def _add_ground(spec: mujoco.MjSpec, friction: float, heights: np.ndarray | None, size: tuple[float, float]) -> None:
+def _add_ground(
+    spec: mujoco.MjSpec, friction: float, contact_time: float, heights: np.ndarray | None, size: tuple[float, float]
+) -> None:
     floor = {"name": "floor", "contype": 1, "conaffinity": 0, "condim": 3, "friction": (friction, 0.005, 0.0001)}
-    floor |= {"priority": 1, "rgba": (0.32, 0.36, 0.3, 1.0)}
+    floor |= {"priority": 1, "solref": (contact_time, 1.0), "rgba": (0.32, 0.36, 0.3, 1.0)}
     spec.worldbody.add_light(pos=(0, 0, 4), dir=(0.2, 0.2, -1), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
     if heights is None:
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 0.05), **floor)

@@ -23,7 +23,7 @@ class PPOUpdate:
     released code (method notes, section 3.7).
 
     Args:
-        loss: a loss that returns ``loss_objective``, ``loss_critic`` and ``loss_entropy``.
+        loss: a loss whose entries ``loss_...`` add up to what is descended, as TorchRL's do.
         optimizer: optimiser of policy and critic.
         epochs: passes over the batch.
         minibatches: minibatches of a pass.
@@ -64,7 +64,12 @@ class PPOUpdate:
         self.schedule = schedule
 
     def __call__(
-        self, batch: TensorDictBase, generator: torch.Generator, extra: Extra | None = None
+        self,
+        batch: TensorDictBase,
+        generator: torch.Generator,
+        extra: Extra | None = None,
+        *,
+        critic_only: bool = False,
     ) -> dict[str, Tensor]:
         """Update on a batch ``[T, N]`` that holds ``advantage`` and ``value_target``.
 
@@ -72,6 +77,7 @@ class PPOUpdate:
             batch: collected experience with advantages.
             generator: source of the minibatch order.
             extra: another loss of a minibatch, added to PPO's.
+            critic_only: leave the policy and the learning rate as they are: a fresh critic would mislead a good policy.
 
         Returns:
             Metrics of the last minibatch, ``kl`` and ``learning_rate``.
@@ -90,15 +96,17 @@ class PPOUpdate:
             for rows in order.split(size)[: self.minibatches]:
                 sample = flat[rows]
                 result = self.loss(sample)
-                loss = result["loss_objective"] + result["loss_critic"] + result["loss_entropy"]
-                if extra is not None:
-                    loss = loss + extra(sample)
+                loss = result["loss_critic"]
+                if not critic_only:
+                    loss = sum(value for name, value in result.items() if name.startswith("loss_"))
+                    if extra is not None:
+                        loss = loss + extra(sample)
                 self.optimizer.zero_grad(set_to_none=True)
                 loss.backward()
                 torch.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
                 self.optimizer.step()
             metrics = {name: value.detach() for name, value in result.items() if value.numel() == 1}
-            if self.divergence is not None:
+            if self.divergence is not None and not critic_only:
                 with torch.no_grad():
                     metrics["kl"] = self.divergence(sample)
                 if self.schedule is not None:

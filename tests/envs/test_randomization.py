@@ -97,3 +97,14 @@ def test_a_heavier_robot_presses_harder(build: Build) -> None:
             if step >= 60:
                 forces.append(env.simulator.contact_force.sum())
         assert torch.stack(forces).mean().item() == pytest.approx(9.81 * mass, rel=0.05)
+
+
+def test_an_identified_simulator_takes_the_place_of_the_ranges(generator: torch.Generator) -> None:
+    def draw(count: int, source: torch.Generator) -> dict[str, torch.Tensor]:
+        return {"stiffness": 20.0 + torch.rand(count, 1, generator=source).expand(-1, 12)}
+
+    fields, privileged = sample_parameters(100, Randomization(draw=draw), generator)
+    stiffness = fields["stiffness"]
+    assert stiffness.min() >= 20.0 and stiffness.max() <= 21.0 and stiffness.unique().numel() == 100
+    torch.testing.assert_close(privileged[:, 5:17], stiffness / 40.0 - 1.0)
+    assert fields["damping"].std() > 0.1  # what it leaves open is still drawn

@@ -142,3 +142,13 @@ def test_wrong_numbers_are_refused(tmp_path: Path) -> None:
         build_spec(torque_limit=[20.0])
     with pytest.raises(ValueError, match=r"base_0\.obj"):
         build_spec(skin=tmp_path)
+
+
+def test_the_contact_model_is_an_option() -> None:
+    model = build_spec(contact_time=0.05, cone="elliptic").compile()
+    assert model.geom("floor").solref.tolist() == [0.05, 1.0]
+    assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    with pytest.raises(ValueError, match=r"at least twice sim_dt, 0.01 s, got 0.005"):
+        build_spec(contact_time=0.005)
+    with pytest.raises(ValueError, match="pyramidal, elliptic, got 'round'"):
+        build_spec(cone="round")  # type: ignore[arg-type]

@@ -52,8 +52,9 @@ def test_samples_are_consecutive_frames_of_one_clip(dataset: MotionDataset, gene
 
 
 def test_longer_horizons(clips: dict[str, MotionClip], generator: torch.Generator) -> None:
-    motion = MotionDataset([], [clips["free"]], offsets=range(5), features=tag_and_frame).sample_unlabelled(50, generator)
-    assert torch.equal(motion["motion"][:, :, 1].diff(dim=1), torch.ones(50, 4))
+    dataset = MotionDataset([], [clips["free"]], offsets=range(5), features=tag_and_frame)
+    motion = dataset.sample_unlabelled(50, generator)["motion"]
+    assert torch.equal(motion[:, :, 1].diff(dim=1), torch.ones(50, 4))
 
 
 def test_frames_far_apart(clips: dict[str, MotionClip], generator: torch.Generator) -> None:

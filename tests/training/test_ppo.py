@@ -71,3 +71,17 @@ def test_too_few_samples_are_refused() -> None:
     actor, critic, update = build(minibatches=1000)
     with pytest.raises(ValueError, match="at least 1000 samples"):
         update(collect(actor, critic, torch.Generator().manual_seed(1)), torch.Generator())
+
+
+def test_a_warm_up_of_the_critic_leaves_the_policy_alone() -> None:
+    actor, critic, update = build(divergence=lambda sample: torch.tensor(1.0))
+    update.schedule = KLAdaptiveLR(update.optimizer, 0.01)
+    before = [[p.clone() for p in network.parameters()] for network in (actor, critic)]
+    batch = collect(actor, critic, torch.Generator().manual_seed(1))
+    metrics = update(batch, torch.Generator().manual_seed(2), lambda sample: 1 / 0, critic_only=True)
+    same = [
+        all(torch.equal(a, b) for a, b in zip(old, network.parameters(), strict=True))
+        for old, network in zip(before, (actor, critic), strict=True)
+    ]
+    assert same == [True, False]
+    assert metrics["learning_rate"].item() == pytest.approx(3e-3)

@@ -1,0 +1,167 @@
+"""Stage 2b: fine-tune a Basic Behaviour Controller in the identified simulator, and say what it gained.
+
+Source: Fu et al. 2025, supplement S2 (fine-tuning after EASI); the learning is that of ``bbc_pretrain.py``.
+
+In:  a trained BBC (``--init-from RUN``), the simulator that ``easi.py`` found (``--simulator RUN``), the clips; for
+     simulator to simulator, the log's truth (``--target NAME.truth.json``), which only the comparison sees.
+Out: ``runs/NAME/`` as ``bbc_pretrain.py`` writes it, and ``comparison.json``: the controller before and after.
+
+    python recipes/bbc_finetune.py cpu --init-from runs/my_run --simulator runs/easi --target logs/target.truth.json \
+        --motion.labelled DIR --motion.unlabelled DIR
+    python recipes/bbc_finetune.py cpu --resume runs/finetune       # goes on, then compares
+
+Presets: ``smoke`` (seconds), ``cpu`` (about ten minutes on two cores), ``paper``.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import bbc_config
+from bbc_config import MotionConfig
+from bbc_pretrain import train
+from evaluate import Config as Evaluation
+from evaluate import evaluate_behaviours
+from judgement import to_json
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rollouts import MotionConfig as Clips
+from rollouts import load_controller, load_motion
+
+from agility_rl.behaviours import BEHAVIOURS
+from agility_rl.training import cli, metrics
+
+
+@dataclass(frozen=True)
+class Config:
+    name: str = "finetune"
+    """Folder under ``runs``."""
+    runs: Path = Path("runs")
+    seed: int = 0
+    init_from: Path | None = None
+    """Run or artifact folder of the BBC."""
+    simulator: Path | None = None
+    """Run of ``easi.py``, or its ``result.json``."""
+    target: Path | None = None
+    """``NAME.truth.json`` of the log: compare there too."""
+    resume: Path | None = None
+    """Run folder to go on with."""
+    iterations: int | None = None
+    """Iterations of the training, instead of the preset's."""
+    num_threads: int | None = None
+    episodes: int = 50
+    """Episodes of each behaviour in the comparison."""
+    seconds: float = 20.0
+    """Length of an episode."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    training: str = "cpu"
+    """Preset whose other settings hold: ``smoke``, ``cpu`` or ``paper``."""
+
+
+PRESETS = {
+    "smoke": Config(training="smoke", iterations=3, episodes=1, seconds=2.0),
+    "cpu": Config(motion=bbc_config.CPU.motion),
+    "paper": Config(training="paper", motion=bbc_config.PAPER.motion),
+}
+ITERATIONS = {"smoke": 3, "cpu": 120, "paper": 10_000}
+"""The paper states no number of its own for the fine-tuning (method notes, section 11)."""
+
+
+def training(cfg: Config) -> bbc_config.Config:
+    """Settings of the training: those of the preset, for a policy that can already walk."""
+    if cfg.training not in ITERATIONS:
+        raise ValueError(f"--training must be one of {', '.join(ITERATIONS)}, got {cfg.training!r}")
+    base, hidden = bbc_config.PRESETS[cfg.training], bbc_config.PRESETS[cfg.training].ppo.hidden
+    if cfg.init_from is not None:
+        hidden = tuple(load_controller(cfg.init_from).artifact.manifest["network"]["hidden"])
+    return replace(
+        base,
+        name=cfg.name,
+        runs=cfg.runs,
+        seed=cfg.seed,
+        init_from=cfg.init_from,
+        resume=cfg.resume,
+        iterations=cfg.iterations or ITERATIONS[cfg.training],
+        max_minutes=None,
+        motion=cfg.motion,
+        env=replace(
+            base.env,
+            simulator=cfg.simulator,
+            num_threads=cfg.num_threads,
+            progress_weight=base.env.progress_left,  # no fading: it walks already
+            progress_left=base.env.progress_left,
+        ),
+        ppo=replace(
+            base.ppo,
+            critic_warm_up=min(20, (cfg.iterations or ITERATIONS[cfg.training]) // 2),
+            learning_rate=base.ppo.learning_rate / 3,
+            max_learning_rate=base.ppo.max_learning_rate / 3,
+            desired_kl=None if base.ppo.desired_kl is None else base.ppo.desired_kl / 2,
+            hidden=hidden,
+        ),
+        imitation=replace(base.imitation, cloning=0, information_ramp=(0, 1)),
+    )
+
+
+def compare(cfg: Config, run: Path, console: Console) -> dict[str, Any]:
+    """Measure the controllers before and after in the identified simulator, and in the target if it is known."""
+    assert cfg.init_from is not None and cfg.simulator is not None
+    places = {"identified": cfg.simulator} | ({"target": cfg.target} if cfg.target else {})
+    motion = load_motion(Clips(cfg.motion.labelled, cfg.motion.unlabelled), {}, cfg.seed)
+    states = motion.start_states(cfg.seed)
+    result: dict[str, Any] = {}
+    for place, simulator in places.items():
+        for stage, path in (("before", cfg.init_from), ("after", run)):
+            controller = load_controller(path)
+            options = Evaluation(
+                path, episodes=cfg.episodes, seconds=cfg.seconds, seed=cfg.seed, simulator=simulator, switches=0
+            )
+            figures = run / "figures" / f"{place}_{stage}"
+            found = evaluate_behaviours(controller, options, motion, states, figures)
+            result.setdefault(place, {})[stage] = found
+        console.print(table(f"in the {place} simulator", result[place]))
+    return result
+
+
+def table(title: str, found: dict[str, Any]) -> Table:
+    """What changed, by behaviour."""
+    rows = Table("commanded", "measured", title=title, box=SIMPLE_HEAD, pad_edge=False)
+    for stage in found:
+        rows.add_column(f"{stage} (95 %)", justify="right")
+
+    def show(interval: metrics.Interval | None) -> str:
+        return "-" if interval is None else f"{interval.estimate:.3f} ({interval.low:.3f} to {interval.high:.3f})"
+
+    for name in BEHAVIOURS:
+        entries = [stage["behaviours"][name] for stage in found.values()]
+        for key in ("recognised", "falls"):
+            rows.add_row(name, key, *(show(entry[key]) for entry in entries))
+        for key, unit in (("speed", "m/s"), ("yaw rate", "rad/s")):
+            rows.add_row(name, f"{key} error, {unit}", *(show(entry["errors"].get(key)) for entry in entries))
+    return rows
+
+
+def main(cfg: Config, console: Console | None = None) -> Path:
+    """Fine-tune, then compare; returns the run folder."""
+    wide = None if sys.stdout.isatty() else 120  # a file has no width: do not fold the tables to 80 columns
+    console = console or Console(soft_wrap=True, highlight=False, width=wide)
+    if cfg.resume is not None:
+        own = cli.read_config(cfg.resume, bbc_config.Config)
+        cfg = replace(cfg, init_from=own.init_from, simulator=own.env.simulator, motion=own.motion)
+    if cfg.init_from is None or cfg.simulator is None:
+        raise ValueError("give --init-from RUN, the BBC to fine-tune, and --simulator RUN, what easi.py found")
+    if cfg.target is not None and not cfg.target.is_file():
+        raise FileNotFoundError(f"--target {cfg.target}: no such file; record_log.py writes NAME.truth.json")
+    run = train(training(cfg))
+    cli.write_json(run / "comparison.json", to_json(compare(cfg, run, console)))
+    console.print(f"saved {run / 'comparison.json'}", markup=False)
+    return run
+
+
+if __name__ == "__main__":
+    with cli.one_line_errors():
+        main(cli.from_presets(PRESETS, default="cpu", doc=__doc__))

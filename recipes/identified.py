@@ -1,0 +1,82 @@
+"""Simulators read from files: what a search found (``result.json``), or the known truth of a recorded log."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from agility_rl.collectors import ParameterSpace
+from agility_rl.collectors.parameters import Parameter
+from agility_rl.envs.randomization import NOMINAL, Randomization
+
+
+@dataclass(frozen=True)
+class SimulatorFile:
+    """A distribution of simulators.
+
+    Attributes:
+        draw: fields for ``Simulator.set_parameters`` of a number of robots.
+        model: options of the model that differ from its defaults, such as the friction of the joints.
+        text: for people.
+    """
+
+    draw: Callable[[int, torch.Generator], dict[str, Tensor]]
+    model: Mapping[str, Any]
+    text: str
+
+    @property
+    def randomization(self) -> Randomization:
+        """These simulators for an environment; what they leave open is nominal."""
+        return replace(NOMINAL, draw=self.draw)
+
+
+def load_simulator(path: Path) -> SimulatorFile:
+    """Read ``result.json`` of ``easi.py`` (a Gaussian) or ``NAME.truth.json`` of ``record_log.py`` (one simulator).
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is neither, or damaged.
+    """
+    path = path / "result.json" if path.is_dir() else path
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected result.json of easi.py or NAME.truth.json of record_log.py, no file")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        parameters = content["parameters"]
+        return _found(content, parameters) if "search" in content else _truth(content, parameters)
+    except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:  # bad JSON is a ValueError too
+        raise ValueError(f"{path} is damaged, or no result of easi.py nor truth of record_log.py: {error}") from error
+
+
+def _found(content: Mapping[str, Any], parameters: Mapping[str, Any]) -> SimulatorFile:
+    search = content["search"]
+    space = ParameterSpace([Parameter.named(name, **search["ranges"][name]) for name in parameters])
+    mean = torch.tensor(search["mean"], dtype=torch.float64)
+    values, vectors = torch.linalg.eigh(torch.tensor(search["covariance"], dtype=torch.float64))
+    root = vectors * values.clamp_min(0.0).sqrt()
+
+    def draw(count: int, generator: torch.Generator) -> dict[str, Tensor]:
+        normal = torch.randn((count, len(mean)), generator=generator, dtype=torch.float64)
+        return space.fields(space.denormalize(mean + normal @ root.mT))
+
+    return SimulatorFile(draw, content.get("model", {}), _describe(parameters, "mean"))
+
+
+def _truth(content: Mapping[str, Any], parameters: Mapping[str, Any]) -> SimulatorFile:
+    space = ParameterSpace(tuple(parameters))
+    values = torch.tensor([[float(entry["value"]) for entry in parameters.values()]], dtype=torch.float64)
+
+    def draw(count: int, generator: torch.Generator) -> dict[str, Tensor]:
+        return space.fields(values.expand(count, -1))
+
+    return SimulatorFile(draw, dict(content["recording"]["model"]), _describe(parameters, "value"))
+
+
+def _describe(parameters: Mapping[str, Any], key: str) -> str:
+    return ", ".join(f"{name} {float(entry[key]):.4g} {entry['unit']}" for name, entry in parameters.items())
