@@ -31,6 +31,10 @@ class RewardTerm(NamedTuple):
     function: RewardFunction
 
 
+SLOW = 0.1
+"""Below this commanded speed a miss counts as at it [m/s]."""
+
+
 def linear_velocity(state: LocomotionState) -> Tensor:
     """``exp(-|v*_xy - v_xy|^2 / 0.25)``, base frame."""
     error = (state.command[:, :2] - state.linear_velocity[:, :2]).square().sum(-1)
@@ -43,15 +47,15 @@ def yaw_rate(state: LocomotionState) -> Tensor:
 
 
 def velocity_progress(state: LocomotionState) -> Tensor:
-    """``clip(v*_xy . v_xy / |v*_xy|^2, -1, 1)``, and 1 where no velocity is commanded.
+    """``max(1 - |v - v*| / max(v*, 0.1 m/s), -1)`` with the speed v in the commanded direction and the commanded v*.
 
-    Ours, for beginners: it pays nothing for standing and has a slope there, where the exponential of
-    :func:`linear_velocity` has none. It does not hold the robot back; that is the exponential's part.
+    Ours: it pays nothing for standing and has a slope there, where the exponential of :func:`linear_velocity` has
+    almost none, and it is as steep for a slow walk as for a canter. What goes sideways is the exponential's part.
     """
     wanted = state.command[:, :2]
-    square = wanted.square().sum(-1)
-    along = (wanted * state.linear_velocity[:, :2]).sum(-1)
-    return torch.where(square > 0.0, (along / square.clamp(min=1e-6)).clamp(-1.0, 1.0), 1.0)
+    speed = wanted.norm(dim=-1)
+    along = (wanted * state.linear_velocity[:, :2]).sum(-1) / speed.clamp(min=1e-6)
+    return (1.0 - (along - speed).abs() / speed.clamp(min=SLOW)).clamp(min=-1.0)
 
 
 def jump_height_window(state: LocomotionState) -> Tensor:
