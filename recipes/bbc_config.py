@@ -164,11 +164,38 @@ class Config:
     """Run folder to go on with."""
     init_from: Path | None = None
     """Run or artifact folder whose policy to start from."""
+    changes: tuple[tuple[int, str, float], ...] = ()
+    """Options that take another value from an iteration on: ``300 ppo.entropy 0.001 500 env.jump-weight 12 ...``."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     adaptation: AdaptationConfig = field(default_factory=AdaptationConfig)
+
+
+CHANGEABLE = ("ppo.entropy", "env.jump_weight")
+CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
+"""Options that may change during a run."""
+
+
+def check_changes(cfg: Config) -> None:
+    """Refuse changes of options that cannot change.
+
+    Raises:
+        ValueError: naming the option and those that can.
+    """
+    for _, option, _ in cfg.changes:
+        if option.replace("-", "_") not in CHANGEABLE:
+            raise ValueError(f"--changes: {option} cannot change in a run, only {', '.join(CHANGEABLE)} can")
+
+
+def at(cfg: Config, iteration: int) -> Config:
+    """The configuration with the changes that hold at an iteration; of two, the one further behind."""
+    for start, option, value in cfg.changes:
+        if iteration >= start:
+            section, name = option.replace("-", "_").split(".")
+            cfg = replace(cfg, **{section: replace(getattr(cfg, section), **{name: value})})
+    return cfg
 
 
 PAPER = Config(

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import torch
 from bbc_cloning import clone_behaviour
-from bbc_config import PRESETS, Config, ImitationConfig
+from bbc_config import PRESETS, Config, ImitationConfig, at, check_changes
 from bbc_setup import Components, build, policy_folder, save_policy
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -148,6 +148,7 @@ def train(cfg: Config) -> Path:
     if cfg.resume is not None:  # a run goes on with its own options; only how long may change
         own = cli.read_config(cfg.resume, Config)
         cfg = replace(own, resume=cfg.resume, iterations=cfg.iterations, max_minutes=cfg.max_minutes)
+    check_changes(cfg)
     parts = build(cfg)
     folder = cli.start_run(cfg, cfg.resume or cfg.runs / cfg.name, resume=cfg.resume is not None, recipe="bbc_pretrain")
     progress = {"iteration": 0, "minutes": 0.0}
@@ -193,6 +194,10 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         now = time.perf_counter()
         times[f"time/{name}"], clock = now - clock, now
 
+    cfg = at(cfg, iteration)
+    parts.ppo.loss.entropy_coeff.fill_(cfg.ppo.entropy)
+    jump = parts.env.rewards["jump_height"]
+    parts.env.rewards["jump_height"] = jump._replace(weight=cfg.env.jump_weight)
     if progress := parts.env.rewards.get("velocity_progress"):
         fading = cfg.env.progress_weight - cfg.env.progress_left
         faded = functional.linear_ramp(iteration, *cfg.env.progress_fade, fading)

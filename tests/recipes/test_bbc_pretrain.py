@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -116,3 +118,17 @@ def test_a_truncated_checkpoint_is_refused_and_left_alone(finished: Path, tmp_pa
     assert "damaged" in result.stderr and "Traceback" not in result.stderr
     assert newest.stat().st_size == 1000
     assert RunCheckpoint(newest.parent, counters={}).steps() == (1,)
+
+
+def test_options_change_at_their_iterations(module: Callable[[str], ModuleType]) -> None:
+    config = module("bbc_config")
+    cfg = config.Config(changes=((2, "ppo.entropy", 0.1), (4, "ppo.entropy", 0.2), (3, "env.jump-weight", 9.0)))
+    assert [config.at(cfg, iteration).ppo.entropy for iteration in range(6)] == [0.01, 0.01, 0.1, 0.1, 0.2, 0.2]
+    assert [config.at(cfg, iteration).env.jump_weight for iteration in (2, 3)] == [6.0, 9.0]
+
+
+def test_what_cannot_change_in_a_run_is_refused(finished: Path) -> None:
+    result = run(finished, "--name", "changing", "--changes", "3", "ppo.gamma", "0.5", check=False)
+    assert result.returncode != 0 and "Traceback" not in result.stderr
+    assert "ppo.gamma cannot change in a run, only ppo.entropy" in result.stderr
+    assert not (finished / "changing").exists()
