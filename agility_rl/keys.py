@@ -60,3 +60,15 @@ MEASUREMENT = "measurement"
 
 TRANSITION_LOGIT = "transition_logit"
 """float32 ``[*B, 1]``, D(s, a, s'): high on the robot's transitions, low on the simulator's."""
+
+BEHAVIOUR = "behaviour"
+"""int64 ``[*B]``, under :data:`ACTION`: the behaviour that the teacher or student chose; indexes as :data:`SKILL`."""
+
+PARAMETERS = "parameters"
+"""float32 ``[*B, K, 6]``, under :data:`ACTION`: v_x, v_y, yaw rate, jump height, locomotion height, shift of each."""
+
+SCANDOTS = "scandots"
+"""float32 ``[*B, 132]``, how far the terrain lies below trunk height - 0.3 [m], at 11 x 12 points ahead, flattened."""
+
+TERRAIN_LATENT = "terrain_latent"
+"""float32 ``[*B, 32]``, encoding of the scandots, or of depth images."""

@@ -234,6 +234,54 @@ def gaussian_kl(loc: Tensor, scale: Tensor, other_loc: Tensor, other_scale: Tens
     return (0.5 * (ratio.square() + distance.square() - 1.0) - ratio.log()).sum(-1)
 
 
+def clipped_surrogate(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float) -> Tensor:
+    r"""Clipped surrogate objective of proximal policy optimisation, as a loss.
+
+    .. math:: -\min\left(\rho A, \; \mathrm{clip}(\rho, 1 - \epsilon, 1 + \epsilon) A\right)
+
+    No gradient is left once the ratio is outside the clip on the side that the advantage favours.
+
+    Source: Schulman et al. 2017, arXiv:1707.06347, Eq. (7).
+
+    Args:
+        log_ratio: ``[*B]``, log-probability of the action now minus that at collection.
+        advantage: ``[*B]``.
+        clip_epsilon: half width of the interval in which the ratio is free.
+
+    Returns:
+        ``[*B]``.
+
+    Example:
+        >>> clipped_surrogate(torch.tensor([2.0, 2.0]).log(), torch.tensor([1.0, -1.0]), 0.2)
+        tensor([-1.2000,  2.0000])
+    """
+    ratio = log_ratio.exp()
+    clipped = ratio.clamp(1.0 - clip_epsilon, 1.0 + clip_epsilon)
+    return -torch.minimum(ratio * advantage, clipped * advantage)
+
+
+def divergence_estimate(log_ratio: Tensor) -> Tensor:
+    r"""Estimate of the divergence KL(p || q) [nat] from samples of p, never negative and without bias.
+
+    .. math:: \rho - 1 - \log \rho, \qquad \rho = q(a) / p(a)
+
+    It needs no more than log-probabilities; where the parameters of both policies are known, prefer the exact value.
+
+    Source: third estimator of Schulman 2020, "Approximating KL divergence".
+
+    Args:
+        log_ratio: ``[*B]``, log q - log p of samples of p.
+
+    Returns:
+        ``[*B]``.
+
+    Example:
+        >>> divergence_estimate(torch.tensor([0.0, 1.0]))
+        tensor([0.0000, 0.7183])
+    """
+    return log_ratio.expm1() - log_ratio
+
+
 def linear_ramp(step: float, start: float, length: float, final: float = 1.0) -> float:
     r"""Coefficient that rises linearly from 0 to its final value, and stays there.
 

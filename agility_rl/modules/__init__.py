@@ -8,8 +8,10 @@ from agility_rl.modules.behaviour_controller import BasicBehaviourController
 from agility_rl.modules.critic import Critic
 from agility_rl.modules.discriminator import Discriminator, MotionTrunk
 from agility_rl.modules.estimator import StateEstimator
+from agility_rl.modules.hybrid_actor import HybridActor, selected_parameters
 from agility_rl.modules.normalization import FeatureNormalizer
 from agility_rl.modules.predictor import Predictor
+from agility_rl.modules.scandots import ScandotsEncoder
 from agility_rl.modules.skill_prior import SkillPrior
 from agility_rl.modules.transition_discriminator import TransitionDiscriminator
 
@@ -21,10 +23,13 @@ __all__ = [
     "FeatureNormalizer",
     "GaussianActor",
     "HistoryEncoder",
+    "HybridActor",
     "MotionTrunk",
     "Predictor",
     "PrivilegedEncoder",
+    "ScandotsEncoder",
     "SkillPrior",
     "StateEstimator",
     "TransitionDiscriminator",
+    "selected_parameters",
 ]

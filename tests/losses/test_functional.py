@@ -100,6 +100,32 @@ def test_gaussian_kl_is_torchs() -> None:
     assert F.gaussian_kl(loc, scale, loc, scale).abs().max() < 1e-6
 
 
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "expected", "slope"),
+    [
+        (1.1, 2.0, -2.2, -2.0),  # inside: minus ratio times advantage
+        (1.5, 2.0, -2.4, 0.0),  # good and already likelier: flat
+        (0.5, 2.0, -1.0, -2.0),  # good and less likely: free to rise
+        (0.5, -2.0, 1.6, 0.0),  # bad and already less likely: flat
+        (1.5, -2.0, 3.0, 2.0),  # bad and likelier: free to fall
+    ],
+)
+def test_clipped_surrogate(ratio: float, advantage: float, expected: float, slope: float) -> None:
+    log_ratio = torch.tensor([math.log(ratio)], requires_grad=True)
+    surrogate = F.clipped_surrogate(log_ratio, torch.tensor([advantage]), 0.2)
+    assert surrogate.item() == pytest.approx(expected)
+    surrogate.sum().backward()
+    assert log_ratio.grad.item() == pytest.approx(slope * ratio)  # d loss / d log ratio
+
+
+def test_divergence_estimate_is_unbiased_and_never_negative() -> None:
+    p, q = Normal(0.0, 1.0), Normal(0.3, 1.2)
+    sample = torch.randn(200_000, generator=torch.Generator().manual_seed(0))
+    estimate = F.divergence_estimate(q.log_prob(sample) - p.log_prob(sample))
+    assert estimate.min() >= 0.0
+    assert estimate.mean().item() == pytest.approx(kl_divergence(p, q).item(), rel=0.02)
+
+
 def test_linear_ramp() -> None:
     assert [F.linear_ramp(t, 200, 10_000) for t in (0, 200, 5_200, 10_200, 99_999)] == [0.0, 0.0, 0.5, 1.0, 1.0]
     assert [F.linear_ramp(t, 5, 0, 0.1) for t in (4, 5)] == [0.0, 0.1]
