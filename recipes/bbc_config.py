@@ -136,6 +136,9 @@ class ImitationConfig:
     height_deviation: float = 0.0
     """Least standard deviation by which the discriminator's trunk height is normalised [m]. The dogs' is 0.018, the
     robot's PD controller sags by 0.05: the height alone then tells a beginner from a dog."""
+    velocity_weight: float = 1.0
+    """Weight of joint and turning velocities in what discriminator and predictor see. A dog's are smooth; a robot's
+    jump at every contact and exploring action, by which it is told apart however well it walks."""
     hidden: tuple[int, ...] = (512, 256)
 
 
@@ -213,7 +216,12 @@ PAPER = Config(
 CPU = Config(
     iterations=1000,
     max_minutes=58.0,
-    motion=MotionConfig(offsets=(0, 8, 16, 23, 24), standing_weight=0.0),
+    changes=(
+        (240, "imitation.imitation_reward", 4.0),
+        (240, "imitation.skill_reward", 2.0),
+        (350, "ppo.entropy", 0.0005),
+    ),
+    motion=MotionConfig(offsets=(0, 6, 12, 18, 24), standing_weight=0.0),
     env=EnvConfig(
         randomize=False,
         push_interval=None,
@@ -223,7 +231,7 @@ CPU = Config(
         episode_length=8.0,
         progress_weight=8.0,
         progress_fade=(120, 120),
-        progress_left=2.0,
+        progress_left=4.0,
         jump_weight=16.0,
         jump_width=0.03,
     ),
@@ -260,6 +268,7 @@ CPU = Config(
         skill_floor=-15.0,
         task_reward=0.25,
         height_deviation=0.06,
+        velocity_weight=0.1,
     ),
     adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
 )

@@ -129,10 +129,15 @@ def build(cfg: Config) -> Components:
     mean, deviation = dataset.statistics()
     height = features.layout_slice(features.MOTION_LAYOUT, "root_height")
     deviation[height].clamp_(min=im.height_deviation)
+    normalizer = FeatureNormalizer(mean, deviation)
+    weight = torch.ones_like(mean)
+    for name in ("angular_velocity", "joint_velocity"):
+        weight[features.layout_slice(features.MOTION_LAYOUT, name)] = im.velocity_weight
+    normalizer.set_weight(weight)
     discriminator = Discriminator(
         horizon=len(cfg.motion.offsets),
         hidden=im.hidden,
-        normalizer=FeatureNormalizer(mean, deviation),
+        normalizer=normalizer,
         num_skills=len(BEHAVIOURS) if im.conditional else None,
     )
     predictor = Predictor(trunk=discriminator.trunk)
