@@ -15,7 +15,7 @@ from torch.nn.functional import avg_pool1d, max_pool1d, mse_loss, pad
 
 from agility_rl import keys, rotations
 from agility_rl.behaviours import BEHAVIOURS, JUMP, NUM_BEHAVIOURS, command_vector
-from agility_rl.envs.locomotion import PEAK_WINDOW
+from agility_rl.envs.robots import PEAK_WINDOW
 from agility_rl.go2 import constants, features
 from agility_rl.modules import BasicBehaviourController
 from agility_rl.motion import MotionClip

@@ -130,6 +130,9 @@ class ImitationConfig:
     skill_reward: float = 0.2
     skill_floor: float | None = None
     """Lift log Q^c to [0, 1] above this floor, so that no reward punishes being alive; ``None`` as published."""
+    gate: float = 0.0
+    """Share of imitation and skill reward that is paid only in proportion to ``velocity_progress`` (needs a weight for
+    it): a standing robot is no bad imitation of a slow dog, and would be content."""
     shift_reward: float = 0.01
     task_reward: float = 0.2
     """Table S1."""
@@ -266,6 +269,7 @@ CPU = Config(
         imitation_reward=2.0,
         skill_reward=1.0,
         skill_floor=-15.0,
+        gate=1.0,
         task_reward=0.25,
         height_deviation=0.06,
         velocity_weight=0.1,

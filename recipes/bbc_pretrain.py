@@ -112,9 +112,10 @@ def add_rewards(parts: Components, cfg: ImitationConfig, batch: TensorDictBase, 
     told = functional.skill_reward(seen[keys.SKILL_LOGITS], skill)
     if cfg.skill_floor is not None:
         told = 1.0 - told.clamp(min=cfg.skill_floor) / cfg.skill_floor
+    paid = dt * (1.0 - cfg.gate * (1.0 - speed_share(parts, batch).flatten(0, 1).clamp(0.0, 1.0)))
     rewards = {
-        "imitation": cfg.imitation_reward * dt * functional.imitation_reward(seen[keys.DISCRIMINATOR_LOGIT]),
-        "skill": cfg.skill_reward * dt * told,
+        "imitation": cfg.imitation_reward * paid * functional.imitation_reward(seen[keys.DISCRIMINATOR_LOGIT]),
+        "skill": cfg.skill_reward * paid * told,
         "shift": cfg.shift_reward * dt * functional.shift_reward(seen[keys.SHIFT_ESTIMATE], shift),
         "task": cfg.task_reward * batch["next", "reward"].flatten(0, 1),
     }
@@ -127,6 +128,14 @@ def add_rewards(parts: Components, cfg: ImitationConfig, batch: TensorDictBase, 
         metrics[f"recovery/{name}"] = recovered[chosen].mean()
         metrics[f"style/{name}"] = style[chosen].mean()
     return metrics
+
+
+def speed_share(parts: Components, batch: TensorDictBase) -> Tensor:
+    """``velocity_progress`` of every step without its weight; 1 where nobody asks for it."""
+    term = parts.env.rewards.get("velocity_progress")
+    if term is None or not term.weight:
+        return torch.ones_like(batch["next", "reward"])
+    return batch["next", keys.REWARD_TERMS, "velocity_progress"] / (term.weight * parts.env.dt)
 
 
 def update_adaptation(parts: Components, minibatches: int, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -198,10 +207,10 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     parts.ppo.loss.entropy_coeff.fill_(cfg.ppo.entropy)
     jump = parts.env.rewards["jump_height"]
     parts.env.rewards["jump_height"] = jump._replace(weight=cfg.env.jump_weight)
-    if progress := parts.env.rewards.get("velocity_progress"):
+    if term := parts.env.rewards.get("velocity_progress"):
         fading = cfg.env.progress_weight - cfg.env.progress_left
         faded = functional.linear_ramp(iteration, *cfg.env.progress_fade, fading)
-        parts.env.rewards["velocity_progress"] = progress._replace(weight=cfg.env.progress_weight - faded)
+        parts.env.rewards["velocity_progress"] = term._replace(weight=cfg.env.progress_weight - faded)
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     parts.env.set_skill_probabilities(parts.prior.sampling_probabilities)
     if parts.env.randomization is not None:

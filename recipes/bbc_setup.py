@@ -247,21 +247,21 @@ def load_motion(cfg: MotionConfig, seed: int) -> MotionDataset:
 
 
 def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
-    """Write the controller as an artifact, with what is needed to run it elsewhere."""
-    synthetic = cfg.motion.labelled is None
-    manifest = build_manifest(
-        "bbc",
-        {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT},
-        control_period=parts.env.dt,
-        data=["synthetic gaits of agility_rl"]
-        if synthetic
-        else [
-            "/".join(folder.resolve().parts[-2:]) for folder in (cfg.motion.labelled, cfg.motion.unlabelled) if folder
-        ],
-    )
-    manifest["network"] = parts.bbc.settings
-    manifest["prior"] = parts.prior.probabilities.tolist()
+    """Write the controller as an artifact, and beside it the discriminator, whose judgement stage 3 rewards."""
+    clips = [cfg.motion.labelled, cfg.motion.unlabelled]
+    data = ["/".join(clip.resolve().parts[-2:]) for clip in clips if clip] or ["synthetic gaits of agility_rl"]
+    layouts = {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT}
+    manifest = build_manifest("bbc", layouts, control_period=parts.env.dt, data=data)
+    manifest |= {"network": parts.bbc.settings, "prior": parts.prior.probabilities.tolist()}
     Artifact.save(folder / "policy", parts.bbc.state_dict(), manifest)
+    layouts = {"motion": features.MOTION_LAYOUT}
+    manifest = build_manifest("discriminator", layouts, control_period=parts.env.dt, data=data)
+    manifest["network"] = {
+        "offsets": list(cfg.motion.offsets),
+        "hidden": list(cfg.imitation.hidden),
+        "num_skills": len(BEHAVIOURS) if cfg.imitation.conditional else None,
+    }
+    Artifact.save(folder / "discriminator", parts.discriminator.state_dict(), manifest)
 
 
 def policy_folder(path: Path) -> Path:

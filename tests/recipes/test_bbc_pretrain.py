@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -132,3 +133,28 @@ def test_what_cannot_change_in_a_run_is_refused(finished: Path) -> None:
     assert result.returncode != 0 and "Traceback" not in result.stderr
     assert "ppo.gamma cannot change in a run, only ppo.entropy" in result.stderr
     assert not (finished / "changing").exists()
+
+
+def test_a_gated_reward_is_paid_in_proportion_to_the_speed(module: Callable[[str], ModuleType]) -> None:
+    recipe, setup, config = module("bbc_pretrain"), module("bbc_setup"), module("bbc_config")
+    parts = setup.build(config.SMOKE)
+    batch = parts.rollout.collect(parts.bbc.privileged_policy()).clone()
+    share = recipe.speed_share(parts, batch)
+    # the same number by hand: the velocity of the next state, which "explicit" of the following step shows
+    command, velocity = batch["command"][:-1, :, :2], 2.0 * batch["explicit"][1:, :, 1:3]
+    wanted = command.norm(dim=-1)
+    along = (command * velocity).sum(-1) / wanted.clamp(min=1e-6)
+    expected = (1.0 - (along - wanted).abs() / wanted.clamp(min=0.1)).clamp(min=-1.0)
+    going_on = ~batch["next", "done"][:-1, :, 0]
+    torch.testing.assert_close(share[:-1, :, 0][going_on], expected[going_on], atol=1e-4, rtol=1e-4)
+
+    def style_and_skill(gate: float) -> torch.Tensor:
+        rewarded = batch.clone()
+        cfg = replace(config.SMOKE.imitation, gate=gate, task_reward=0.0, shift_reward=0.0)
+        recipe.add_rewards(parts, cfg, rewarded, parts.env.dt)
+        return rewarded["next", "reward"]
+
+    torch.testing.assert_close(style_and_skill(1.0), style_and_skill(0.0) * share.clamp(0.0, 1.0))
+    parts.env.rewards.pop("velocity_progress")
+    assert torch.equal(style_and_skill(1.0), style_and_skill(0.0))
+    parts.env.close()
