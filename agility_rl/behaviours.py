@@ -101,6 +101,29 @@ def sample_commands(skill: Tensor, generator: torch.Generator | None = None) -> 
     return command.masked_fill(command.abs() < torch.tensor(DEAD_BAND), 0.0)
 
 
+def commands_from_parameters(skill: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+    """Map parameters in [-1, 1] to the command range of each given skill.
+
+    Source: the Task-Specific Controller's action, method notes, section 5.1; ranges: Table S2.
+
+    Args:
+        skill: int64 ``[*B]``, index into :data:`BEHAVIOURS`.
+        parameters: ``[*B, 6]``, the five commands in the order of :data:`COMMANDS` and the shift; clipped.
+
+    Returns:
+        Commands ``[*B, 5]`` in the units of :data:`COMMANDS`, unused ones zero, and the shift ``[*B, 1]`` as it is.
+
+    Example:
+        >>> command, shift = commands_from_parameters(torch.tensor([2]), torch.zeros(1, 6))
+        >>> [round(number, 3) for number in command[0].tolist()]  # the middle of a trot
+        [1.0, 0.0, 0.0, 0.0, 0.295]
+    """
+    low, high = command_bounds()
+    parameters = parameters.clamp(-1.0, 1.0)
+    command = low[skill] + (high - low)[skill] * (parameters[..., : len(COMMANDS)] + 1.0) / 2.0
+    return command, parameters[..., len(COMMANDS) :]
+
+
 def command_vector(skill: Tensor, command: Tensor, shift: Tensor) -> Tensor:
     """Command observation as networks read it: five commands, shift, one-hot skill.
 

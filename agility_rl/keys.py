@@ -72,3 +72,15 @@ SCANDOTS = "scandots"
 
 TERRAIN_LATENT = "terrain_latent"
 """float32 ``[*B, 32]``, encoding of the scandots, or of depth images."""
+
+HEADING_ERROR = "heading_error"
+"""float32 ``[*B, 2]``, angle from the robot's heading to the current and to the next way-point [rad], in (-pi, pi]."""
+
+OBSTACLE = "obstacle"
+"""float32 ``[*B, 7]``, one-hot type of the obstacle to pass; order of :data:`agility_rl.envs.obstacles.OBSTACLES`."""
+
+OUTCOME = "outcome"
+"""nested bool: ``[*B, 1]`` ``success``, ``finished``; ``[*B, 7]`` ``passed``, ``bypassed``, ``failed``, a type each."""
+
+TERMINATIONS = "terminations"
+"""nested: one bool ``[*B, 1]`` per reason for which an episode fails, true in the step in which it holds."""

@@ -23,42 +23,36 @@ class PlainLocomotion:
 
     def __init__(self, env: LocomotionEnv) -> None:
         self.env = env
+        self.terms: dict[str, Tensor] = {}
 
     def reset(self, mask: Tensor) -> Observation:
         """Start episodes of the rows of a bool mask ``[N]``; returns the observations of all robots."""
-        env, row = self.env, mask[:, None]
+        env = self.env
         env.commands.resample(mask)
         env._place(mask)
         if env.randomization is not None:
-            env._randomize(mask)
+            env.robots.randomize(mask, env.randomization)
         env._step_count = env._step_count.masked_fill(mask, 0)
-        if env.push_steps is not None:
-            phase = torch.randint(env.push_steps, (env.num_robots,), generator=env.generator)
-            env._push_phase = torch.where(mask, phase, env._push_phase)
-        env._action = env._action.masked_fill(row, 0.0)
-        env._joint_velocity = torch.where(row, env.simulator.joint_velocity, env._joint_velocity)
-        env._heights = torch.where(row, env._height(), env._heights)
-        state = env._state(env._action)
-        env._torque = torch.where(row, state.torque, env._torque)
+        env.pushes.begin(mask)
+        state = env.robots.begin(mask, env.commands)
         env.observations.reset(mask, state)
         return self._observe(state)
 
     def step(self, action: Tensor) -> tuple[Observation, Tensor, Tensor, Tensor]:
         """One control step; nobody is reset."""
         env = self.env
-        if env.push_steps is not None:
-            env._push()
-        env.simulator.step(env._default_pose + env._action_scale * action)
+        env.pushes.apply(env.simulator, env._step_count)
+        env.robots.step(action)
         env._step_count = env._step_count + 1
-        env._heights = torch.cat((env._heights[:, 1:], env._height()), -1)
-        state = env._state(action)
+        state = env.robots.state(action, env.commands)
         terms = torch.stack([term.weight * term.function(state) for term in env.rewards.values()])
+        self.terms = dict(zip(env.rewards, terms, strict=True))
         reward = (env.dt * terms).masked_fill(state.unstable, 0.0).sum(0).clamp(min=0.0)
         terminated = body_contact(state) | diverged(state)
         truncated = (env._step_count >= env.max_steps) & ~terminated
         env.commands.advance()
         env.observations.update(state)
-        env._action, env._torque, env._joint_velocity = action, state.torque, state.joint_velocity
+        env.robots.remember(state)
         return self._observe(state), reward, terminated, truncated
 
     def _observe(self, state: LocomotionState) -> Observation:
@@ -66,11 +60,11 @@ class PlainLocomotion:
         return {
             keys.PROPRIOCEPTION: env.observations.history[:, -1],
             keys.EXPLICIT: features.explicit(state.root_height, state.linear_velocity),
-            keys.PRIVILEGED: env._privileged,
+            keys.PRIVILEGED: env.robots.privileged,
             keys.HISTORY: env.observations.history,
             keys.COMMAND: env.commands.vector(),
             keys.PEAK: (state.peak_height * env.commands.jumping)[:, None],
-            keys.MOTION: env.observations.motion,
+            keys.MOTION: env.observations.motion[:, env.observations.motion_offsets],
             keys.SKILL: env.commands.skill,
             keys.SHIFT: env.commands.shift,
         }

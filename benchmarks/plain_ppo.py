@@ -70,7 +70,7 @@ class Plain:
         self.actor = mlp(p + 4 + 29 + 11 + 1, *hidden, 12)
         self.std = nn.Parameter(torch.full((12,), ppo.initial_std))
         self.critic = mlp(p + 4 + 29 + 11 + 1 + (10 * p if ppo.critic_history else 0), *hidden, 1)
-        self.trunk = mlp(2 * features.NUM_MOTION, *im.hidden, activation=nn.ReLU, last=True)
+        self.trunk = mlp(len(cfg.motion.offsets) * features.NUM_MOTION, *im.hidden, activation=nn.ReLU, last=True)
         self.real, self.embedding = nn.Linear(im.hidden[-1], 1), nn.Embedding(NUM_SKILLS, im.hidden[-1])
         self.skill, self.shift = nn.Linear(im.hidden[-1], NUM_SKILLS), nn.Linear(im.hidden[-1], 1)
         self.policy_parameters = [*self.privileged.parameters(), *self.actor.parameters(), self.std]
@@ -91,6 +91,11 @@ class Plain:
 
         self.mean, self.deviation = dataset.statistics()
         self.deviation = self.deviation.clamp(min=1e-4)
+        height = features.layout_slice(features.MOTION_LAYOUT, "root_height")
+        self.deviation[height] = self.deviation[height].clamp(min=im.height_deviation)
+        self.weight = torch.ones_like(self.mean)
+        for name in ("angular_velocity", "joint_velocity"):
+            self.weight[features.layout_slice(features.MOTION_LAYOUT, name)] = im.velocity_weight
         self.unlabelled = dataset.sample_unlabelled(50_000, self.generator)[keys.MOTION]
         labelled = dataset.sample_labelled(50_000, self.generator)
         order = labelled[keys.SKILL].argsort()
@@ -98,7 +103,7 @@ class Plain:
         self.label_count = torch.bincount(self.labels, minlength=NUM_SKILLS)
         self.label_start = self.label_count.cumsum(0) - self.label_count
         self.prior = torch.full((NUM_SKILLS,), 1.0 / NUM_SKILLS)
-        self.replay_motion = torch.zeros(im.replay, 2, features.NUM_MOTION)
+        self.replay_motion = torch.zeros(im.replay, len(cfg.motion.offsets), features.NUM_MOTION)
         self.replay_skill, self.replay_shift = torch.zeros(im.replay, dtype=torch.int64), torch.zeros(im.replay, 1)
         self.replay_size = self.replay_next = 0
         self.memory: dict[str, Tensor] = {}
@@ -118,7 +123,7 @@ class Plain:
             return self.critic(torch.cat(inputs, -1))[:, 0].float()
 
     def normalize(self, motion: Tensor) -> Tensor:
-        return ((motion - self.mean) / self.deviation).clamp(-10.0, 10.0)
+        return ((motion - self.mean) / self.deviation).clamp(-10.0, 10.0) * self.weight
 
     def judge(self, trunk: Tensor, skill: Tensor) -> Tensor:
         logit = self.real(trunk)[:, 0]
@@ -141,7 +146,7 @@ class Plain:
             row = {name: seen[name] for name in stored} | {"estimate": estimate, "loc": loc, "scale": scale}
             row |= {"action": action, "log_prob": log_prob(loc, scale, action), "value": self.value(seen)}
             row |= {"next_motion": after[keys.MOTION], "reward": reward, "terminated": terminated, "done": done}
-            row["next_value"] = torch.zeros(self.n)
+            row |= {"next_value": torch.zeros(self.n), "paid": self.speed_share()}
             for name, entry in row.items():
                 if name not in self.memory:
                     self.memory[name] = torch.empty((self.steps, *entry.shape), dtype=entry.dtype)
@@ -154,6 +159,12 @@ class Plain:
             self.now, last_done = after, done
         self.memory["next_value"][-1] += self.value(self.now).masked_fill(last_done, 0.0)
         return self.memory
+
+    def speed_share(self) -> Tensor:
+        if "velocity_progress" not in self.robots.terms:
+            return torch.ones(self.n)
+        weight = self.robots.env.rewards["velocity_progress"].weight
+        return (self.robots.terms["velocity_progress"] / weight).clamp(0.0, 1.0)
 
     def remember(self, batch: dict[str, Tensor]) -> None:
         motion = batch["next_motion"].flatten(0, 1)
@@ -213,8 +224,11 @@ class Plain:
         trunk = self.trunk(self.normalize(batch["next_motion"].flatten(0, 1)).flatten(1))
         imitation = (1.0 - 0.25 * (self.judge(trunk, skill) - 1.0).square()).clamp(min=0.0)
         known = self.skill(trunk).log_softmax(-1).gather(1, skill[:, None])[:, 0]
+        if im.skill_floor is not None:
+            known = 1.0 - known.clamp(min=im.skill_floor) / im.skill_floor
         near = -(self.shift(trunk) - batch[keys.SHIFT].flatten(0, 1)).abs()[:, 0]
-        style = dt * (im.imitation_reward * imitation + im.skill_reward * known + im.shift_reward * near)
+        paid = 1.0 - im.gate * (1.0 - batch["paid"].flatten())
+        style = dt * (paid * (im.imitation_reward * imitation + im.skill_reward * known) + im.shift_reward * near)
         batch["reward"] = im.task_reward * batch["reward"] + style.view(self.steps, self.n)
 
     def update_policy(self, batch: dict[str, Tensor], pull: float) -> None:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import bbc_config
+import bbc_presets
 from bbc_config import MotionConfig
 from bbc_pretrain import train
 from evaluate import Config as Evaluation
@@ -64,8 +65,8 @@ class Config:
 
 PRESETS = {
     "smoke": Config(training="smoke", iterations=3, episodes=1, seconds=2.0),
-    "cpu": Config(motion=bbc_config.CPU.motion),
-    "paper": Config(training="paper", motion=bbc_config.PAPER.motion),
+    "cpu": Config(motion=bbc_presets.CPU.motion),
+    "paper": Config(training="paper", motion=bbc_presets.PAPER.motion),
 }
 ITERATIONS = {"smoke": 3, "cpu": 120, "paper": 10_000}
 """The paper states no number of its own for the fine-tuning (method notes, section 11)."""
@@ -75,7 +76,7 @@ def training(cfg: Config) -> bbc_config.Config:
     """Settings of the training: those of the preset, for a policy that can already walk."""
     if cfg.training not in ITERATIONS:
         raise ValueError(f"--training must be one of {', '.join(ITERATIONS)}, got {cfg.training!r}")
-    base, hidden = bbc_config.PRESETS[cfg.training], bbc_config.PRESETS[cfg.training].ppo.hidden
+    base, hidden = bbc_presets.PRESETS[cfg.training], bbc_presets.PRESETS[cfg.training].ppo.hidden
     if cfg.init_from is not None:
         hidden = tuple(load_controller(cfg.init_from).artifact.manifest["network"]["hidden"])
     return replace(

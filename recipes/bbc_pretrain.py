@@ -20,7 +20,8 @@ from pathlib import Path
 
 import torch
 from bbc_cloning import clone_behaviour
-from bbc_config import PRESETS, Config, ImitationConfig, at, check_changes
+from bbc_config import Config, ImitationConfig, at, check_changes
+from bbc_presets import PRESETS
 from bbc_setup import Components, build, policy_folder, save_policy
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor

@@ -58,7 +58,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
         "StateEstimationLoss",
         "TransitionDiscriminatorLoss",
     ),
-    "envs": ("LocomotionEnv",),
+    "envs": ("AgilityEnv", "Course", "LocomotionEnv"),
     "collectors": (
         "BehaviourPolicy",
         "EASICollector",

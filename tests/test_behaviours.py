@@ -73,3 +73,12 @@ def test_same_seed_same_commands_whatever_the_global_generator_does() -> None:
 def test_an_unknown_behaviour_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match=r"'gallop' is no behaviour; expected one of walk, pace, trot, canter, jump"):
         skill_index("gallop")
+
+
+def test_parameters_reach_both_ends_of_every_range_and_no_further() -> None:
+    low, high = command_bounds()
+    skill = torch.arange(5)
+    for value, bound in ((-1.0, low), (1.0, high), (-3.0, low), (3.0, high), (0.0, (low + high) / 2)):
+        command, shift = behaviours.commands_from_parameters(skill, torch.full((5, 6), value))
+        torch.testing.assert_close(command, bound)
+        assert torch.equal(shift, torch.full((5, 1), max(-1.0, min(1.0, value))))

@@ -33,4 +33,4 @@ def test_every_key_says_its_shape() -> None:
             name = statement.targets[0].id
             assert isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant), name
             text = str(following.value.value)
-            assert "``[*B" in text and ("float32" in text or "int64" in text), f"{name}: {text}"
+            assert "``[*B" in text and any(kind in text for kind in ("float32", "int64", "bool")), f"{name}: {text}"

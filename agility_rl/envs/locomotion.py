@@ -14,30 +14,13 @@ from torchrl.envs import EnvBase
 from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.observations import HISTORY, ObservationGroups
-from agility_rl.envs.randomization import NOMINAL, Randomization, sample_parameters
+from agility_rl.envs.randomization import Randomization
 from agility_rl.envs.reference import PAST, ReferenceStates
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm
-from agility_rl.envs.state import LocomotionState
+from agility_rl.envs.robots import CLEARANCE, Pushes, Robots
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, Termination
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator, make_simulator
-
-PEAK_WINDOW = 0.9
-"""Seconds over which the highest trunk position counts for a jump."""
-CLEARANCE = 0.005
-"""Height added at a reset, so that no foot starts in the ground [m]."""
-
-_BUFFERS = (
-    "step_count",
-    "push_phase",
-    "action",
-    "torque",
-    "joint_velocity",
-    "heights",
-    "privileged",
-    "stiffness",
-    "damping",
-)
 
 
 class LocomotionEnv(EnvBase):
@@ -114,26 +97,17 @@ class LocomotionEnv(EnvBase):
         self.terminations = tuple(terminations)
         self.randomization = randomization
         self.max_steps = round(episode_length / self.dt)
-        self.push_steps = None if push_interval is None else round(push_interval / self.dt)
-        self.push_velocity = push_velocity
         self.generator = torch.Generator().manual_seed(seed)
         period = None if resample_period is None else round(resample_period / self.dt)
         self.commands = CommandSampler(num_robots, self.generator, period)
         self.observations = ObservationGroups(num_robots, self.generator, observation_noise, motion_offsets)
         self.reference = ReferenceStates.standing() if reference is None else ReferenceStates(reference)
         self.reference.check_past(motion_offsets[-1])
-        self._default_pose = torch.tensor(constants.DEFAULT_POSE)
-        self._action_scale = torch.tensor(constants.ACTION_SCALE)
-
         n = num_robots
+        interval = None if push_interval is None else round(push_interval / self.dt)
+        self.pushes = Pushes(n, self.generator, interval, push_velocity)
+        self.robots = Robots(self.simulator, self.generator)
         self._step_count = torch.zeros(n, dtype=torch.int64)
-        self._push_phase = torch.zeros(n, dtype=torch.int64)
-        self._action = torch.zeros(n, constants.NUM_JOINTS)
-        self._torque = torch.zeros(n, constants.NUM_JOINTS)
-        self._joint_velocity = torch.zeros(n, constants.NUM_JOINTS)
-        self._heights = torch.zeros(n, round(PEAK_WINDOW / self.dt))
-        fields, self._privileged = sample_parameters(n, NOMINAL, self.generator)
-        self._stiffness, self._damping = fields["stiffness"], fields["damping"]
         self._make_specs(n)
 
     def _make_specs(self, n: int) -> None:
@@ -194,21 +168,13 @@ class LocomotionEnv(EnvBase):
             self.commands.resample(mask)
         past = self._place(mask)
         if self.randomization is not None:
-            self._randomize(mask)
+            self.robots.randomize(mask, self.randomization)
         self._step_count = self._step_count.masked_fill(mask, 0)
-        if self.push_steps is not None:
-            phase = torch.randint(self.push_steps, (self.num_robots,), generator=self.generator)
-            self._push_phase = torch.where(mask, phase, self._push_phase)
-
-        row = mask[:, None]
-        self._action = self._action.masked_fill(row, 0.0)
-        self._joint_velocity = torch.where(row, self.simulator.joint_velocity, self._joint_velocity)
-        self._heights = torch.where(row, self._height(), self._heights)
-        state = self._state(self._action)
-        self._torque = torch.where(row, state.torque, self._torque)
+        self.pushes.begin(mask)
+        state = self.robots.begin(mask, self.commands)
         self.observations.reset(mask, state, past)
 
-        observation = self.observations.build(state, self.commands, self._privileged)
+        observation = self.observations.build(state, self.commands, self.robots.privileged)
         nothing = {name: torch.zeros(self.num_robots, 1) for name in self.rewards}
         observation[keys.REWARD_TERMS] = TensorDict(nothing, self.batch_size)
         for name in ("done", "terminated", "truncated"):
@@ -217,13 +183,11 @@ class LocomotionEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict[keys.ACTION]
-        if self.push_steps is not None:
-            self._push(self.push_steps)
-        self.simulator.step(self._default_pose + self._action_scale * action)
+        self.pushes.apply(self.simulator, self._step_count)
+        self.robots.step(action)
         self._step_count = self._step_count + 1
-        self._heights = torch.cat((self._heights[:, 1:], self._height()), -1)
 
-        state = self._state(action)
+        state = self.robots.state(action, self.commands)
         terms = {
             name: (term.weight * self.dt * term.function(state)).masked_fill(state.unstable, 0.0)[:, None]
             for name, term in self.rewards.items()
@@ -234,8 +198,8 @@ class LocomotionEnv(EnvBase):
 
         self.commands.advance()
         self.observations.update(state)
-        self._action, self._torque, self._joint_velocity = action.clone(), state.torque, state.joint_velocity
-        observation = self.observations.build(state, self.commands, self._privileged)
+        self.robots.remember(state)
+        observation = self.observations.build(state, self.commands, self.robots.privileged)
         observation["reward"] = reward
         observation["terminated"], observation["truncated"] = terminated, truncated
         observation["done"] = terminated | truncated
@@ -243,10 +207,6 @@ class LocomotionEnv(EnvBase):
         return observation
 
     # -- physics -----------------------------------------------------------------------------------------------------
-    def _height(self) -> Tensor:
-        position = self.simulator.root_position
-        return position[:, 2:] - self.simulator.ground_height(position[:, :2])[:, None]
-
     def _place(self, mask: Tensor) -> Tensor | None:
         n = self.num_robots
         start = self.reference.sample(self.commands.skill, self.generator)
@@ -265,53 +225,6 @@ class LocomotionEnv(EnvBase):
         )
         return start.get(PAST, None)
 
-    def _randomize(self, mask: Tensor) -> None:
-        assert self.randomization is not None
-        fields, privileged = sample_parameters(self.num_robots, self.randomization, self.generator)
-        self.simulator.set_parameters(mask, **fields)
-        row = mask[:, None]
-        self._privileged = torch.where(row, privileged, self._privileged)
-        self._stiffness = torch.where(row, fields["stiffness"], self._stiffness)
-        self._damping = torch.where(row, fields["damping"], self._damping)
-
-    def _push(self, interval: int) -> None:
-        mask = (self._step_count + self._push_phase) % interval == interval - 1
-        if bool(mask.any()):
-            velocity = self.push_velocity * (2.0 * torch.rand(self.num_robots, 2, generator=self.generator) - 1.0)
-            self.simulator.push(mask, velocity)
-
-    def _state(self, action: Tensor) -> LocomotionState:
-        simulator = self.simulator
-        roll, pitch, yaw = rotations.to_euler(simulator.root_quaternion)
-        target = self._default_pose + self._action_scale * action
-        force = simulator.contact_force
-        legs = force[:, 1:].unflatten(-1, (4, 4))
-        return LocomotionState(
-            root_height=self._heights[:, -1:],
-            roll=roll,
-            pitch=pitch,
-            yaw=yaw,
-            linear_velocity=rotations.rotate_inverse(simulator.root_quaternion, simulator.root_linear_velocity),
-            angular_velocity=simulator.root_angular_velocity,
-            joint_position=simulator.joint_position,
-            joint_velocity=simulator.joint_velocity,
-            previous_joint_velocity=self._joint_velocity,
-            torque=self._stiffness * (target - simulator.joint_position) - self._damping * simulator.joint_velocity,
-            previous_torque=self._torque,
-            action=action,
-            previous_action=self._action,
-            trunk_contact=force[:, 0],
-            hip_contact=legs[..., 0],
-            thigh_contact=legs[..., 1],
-            calf_contact=legs[..., 2],
-            foot_contact=legs[..., 3],
-            command=self.commands.command,
-            jumping=self.commands.jumping,
-            peak_height=self._heights.amax(-1),
-            unstable=simulator.unstable,
-            dt=self.dt,
-        )
-
     # -- resume ------------------------------------------------------------------------------------------------------
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:  # type: ignore[override]
         """Everything that an exact continuation needs: simulator, commands, memories, clocks, generator."""
@@ -319,7 +232,11 @@ class LocomotionEnv(EnvBase):
             "simulator": self.simulator.state_dict(),
             "commands": self.commands.state_dict(),
             "observations": self.observations.state_dict(),
-            "buffers": {name: getattr(self, f"_{name}").clone() for name in _BUFFERS},
+            "buffers": {
+                "step_count": self._step_count.clone(),
+                "push_phase": self.pushes.phase.clone(),
+                **self.robots.state_dict(),
+            },
             "generator": self.generator.get_state(),
         }
 
@@ -328,8 +245,9 @@ class LocomotionEnv(EnvBase):
         self.simulator.load_state_dict(state_dict["simulator"])
         self.commands.load_state_dict(state_dict["commands"])
         self.observations.load_state_dict(state_dict["observations"])
-        for name in _BUFFERS:
-            setattr(self, f"_{name}", state_dict["buffers"][name].clone())
+        buffers = state_dict["buffers"]
+        self._step_count, self.pushes.phase = buffers["step_count"].clone(), buffers["push_phase"].clone()
+        self.robots.load_state_dict(buffers)
         self.generator.set_state(state_dict["generator"])
 
     def close(self, *, raise_if_closed: bool = True) -> None:

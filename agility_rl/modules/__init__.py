@@ -13,6 +13,7 @@ from agility_rl.modules.normalization import FeatureNormalizer
 from agility_rl.modules.predictor import Predictor
 from agility_rl.modules.scandots import ScandotsEncoder
 from agility_rl.modules.skill_prior import SkillPrior
+from agility_rl.modules.teacher import Teacher
 from agility_rl.modules.transition_discriminator import TransitionDiscriminator
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "ScandotsEncoder",
     "SkillPrior",
     "StateEstimator",
+    "Teacher",
     "TransitionDiscriminator",
     "selected_parameters",
 ]

@@ -22,6 +22,9 @@ from agility_rl.keys import ACTION, BEHAVIOUR, PARAMETERS
 from agility_rl.modules.actor import DiagonalGaussian, GaussianNetwork
 from agility_rl.modules.mlp import ConcatenatedMLP, mlp
 
+FORBIDDEN = -1e6
+"""Added to the logit of a choice that is not allowed; finite, so that its entropy is 0 and not NaN."""
+
 
 class HybridActor(ProbabilisticTensorDictSequential):
     r"""Act by a categorical choice and a Gaussian over continuous parameters, two heads on one trunk.
@@ -61,6 +64,7 @@ class HybridActor(ProbabilisticTensorDictSequential):
         hidden: size of every hidden layer of the trunk (ELU).
         initial_std: standard deviation at the start, in units of the parameters.
         min_std: floor of the standard deviation, one number or a tensor that expands to ``continuous_shape``.
+        allowed: indices of the choices that may be taken; ``None`` for all.
         sequence_keys: inputs that end in ``[T, F]``; they are flattened.
         choice_key: key of the choice.
         parameters_key: key of the continuous action.
@@ -97,6 +101,7 @@ class HybridActor(ProbabilisticTensorDictSequential):
         hidden: Sequence[int] = (512, 256, 128),
         initial_std: float = 1.0,
         min_std: Tensor | float = 0.1,
+        allowed: Sequence[int] | None = None,
         sequence_keys: Sequence[NestedKey] = (),
         choice_key: NestedKey = (ACTION, BEHAVIOUR),
         parameters_key: NestedKey = (ACTION, PARAMETERS),
@@ -112,6 +117,7 @@ class HybridActor(ProbabilisticTensorDictSequential):
             continuous_shape,
             initial_std,
             min_std,
+            allowed,
         )
         super().__init__(
             TensorDictModule(network, in_keys=list(in_keys), out_keys=[logits_key, loc_key, scale_key]),
@@ -145,6 +151,8 @@ class HybridNetwork(nn.Module):
         [(7, 4), (7, 4, 2), (7, 4, 2)]
     """
 
+    mask: Tensor
+
     def __init__(
         self,
         trunk: nn.Module,
@@ -153,6 +161,7 @@ class HybridNetwork(nn.Module):
         continuous_shape: Sequence[int],
         initial_std: float,
         min_std: Tensor | float,
+        allowed: Sequence[int] | None = None,
     ) -> None:
         super().__init__()
         if num_choices < 2 or not continuous_shape or min(continuous_shape) < 1:
@@ -161,6 +170,12 @@ class HybridNetwork(nn.Module):
                 f"num_choices={num_choices}, continuous_shape={tuple(continuous_shape)}; for one kind of action use "
                 "GaussianActor, or a categorical policy"
             )
+        mask = torch.zeros(num_choices)
+        if allowed is not None:
+            if not allowed or not set(allowed) <= set(range(num_choices)):
+                raise ValueError(f"allowed must name choices 0 to {num_choices - 1}, got {tuple(allowed)}")
+            mask[[index for index in range(num_choices) if index not in allowed]] = FORBIDDEN
+        self.register_buffer("mask", mask)
         self.continuous_shape = tuple(continuous_shape)
         num_continuous = math.prod(self.continuous_shape)
         floor = torch.as_tensor(min_std).expand(self.continuous_shape).flatten()
@@ -175,7 +190,7 @@ class HybridNetwork(nn.Module):
         features = self.trunk(*inputs)
         loc, scale = self.parameters_head(features)  # [*B, K P]
         shape = self.continuous_shape
-        return self.choice_head(features), loc.unflatten(-1, shape), scale.unflatten(-1, shape)
+        return self.choice_head(features) + self.mask, loc.unflatten(-1, shape), scale.unflatten(-1, shape)
 
     def project_std(self) -> None:
         """Raise the standard-deviation parameter to its floor, in place."""

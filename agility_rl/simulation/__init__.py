@@ -1,7 +1,18 @@
 """Physics of many robots at once, behind one protocol."""
 
 from agility_rl.simulation.batch import BatchSimulator
+from agility_rl.simulation.scenery import Hinge, Piece, Shape
 from agility_rl.simulation.simulator import PARAMETERS, Simulator, make_simulator
 from agility_rl.simulation.terrain import HeightField, rough_pyramids
 
-__all__ = ["PARAMETERS", "BatchSimulator", "HeightField", "Simulator", "make_simulator", "rough_pyramids"]
+__all__ = [
+    "PARAMETERS",
+    "BatchSimulator",
+    "HeightField",
+    "Hinge",
+    "Piece",
+    "Shape",
+    "Simulator",
+    "make_simulator",
+    "rough_pyramids",
+]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from agility_rl.go2 import constants
 from agility_rl.go2.model import ROBOT_GROUP, build_spec
+from agility_rl.simulation.scenery import Piece, add_scenery, hinge_name
 from agility_rl.simulation.simulator import PARAMETERS
 from agility_rl.simulation.terrain import HeightField
 
@@ -26,13 +28,15 @@ _WARNINGS = [
         mujoco.mjtWarning.mjWARN_BADCTRL,
     )
 ]
-_NUM_FORCES = 3 * len(constants.CONTACT_GROUPS)
+# The robot is the model's first tree, and its contact forces are the first sensors; scenery comes behind.
+_JOINTS, _JOINT_SPEEDS = slice(7, 7 + constants.NUM_JOINTS), slice(6, 6 + constants.NUM_JOINTS)
+_FORCES = slice(0, 3 * len(constants.CONTACT_GROUPS))
 _TERRAIN_MARGIN = 2.0
 """Robots start at least this far from the edge of a height field [m]."""
 _FLAT = {
-    "joint_damping": ("dof_damping", slice(6, None)),
-    "armature": ("dof_armature", slice(6, None)),
-    "friction_loss": ("dof_frictionloss", slice(6, None)),
+    "joint_damping": ("dof_damping", _JOINT_SPEEDS),
+    "armature": ("dof_armature", _JOINT_SPEEDS),
+    "friction_loss": ("dof_frictionloss", _JOINT_SPEEDS),
 }
 
 
@@ -48,6 +52,7 @@ class BatchSimulator:
         control_dt: control step [s], a multiple of ``sim_dt``.
         sim_dt: physics step [s].
         terrain: height field instead of a plane.
+        scenery: pieces that every simulation places for itself by :meth:`place`; below the ground until then.
         **model_options: keyword arguments of :func:`agility_rl.go2.model.build_spec`.
 
     Raises:
@@ -68,6 +73,7 @@ class BatchSimulator:
         control_dt: float = constants.CONTROL_DT,
         sim_dt: float = constants.SIM_DT,
         terrain: HeightField | None = None,
+        scenery: Sequence[Piece] = (),
         **model_options: Any,
     ) -> None:
         substeps = control_dt / sim_dt
@@ -82,16 +88,29 @@ class BatchSimulator:
         self.ground_extent = 0.0 if terrain is None else min(terrain.half_size) - _TERRAIN_MARGIN
         if terrain is not None:
             model_options |= {"heights": terrain.heights.numpy(), "height_field_size": terrain.half_size}
-        self.model: mujoco.MjModel = build_spec(sim_dt=sim_dt, **model_options).compile()
+        self.scenery: Sequence[Piece] = tuple(scenery)
+        spec = build_spec(sim_dt=sim_dt, **model_options)
+        add_scenery(spec, self.scenery)
+        self.model: mujoco.MjModel = spec.compile()
         self.batch = Batch(self.model, num_simulations, self.num_threads)
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl, self._sensordata = self.batch.bind("ctrl"), self.batch.bind("sensordata")
+        if self.scenery:
+            self._mocap_position, self._mocap_quaternion = self.batch.bind("mocap_pos"), self.batch.bind("mocap_quat")
+        hinges = [self.model.joint(hinge_name(piece)) for piece in self.scenery if piece.hinge is not None]
+        self._hinges = [int(joint.qposadr[0]) for joint in hinges]
+        self._hinge_speeds = [int(joint.dofadr[0]) for joint in hinges]
+        bodies = {name for piece in self.scenery for name in (piece.name, f"{piece.name}/moving")}
+        geoms = (self.model.geom(index) for index in range(self.model.ngeom))
+        self._ground = np.array(
+            [geom.id for geom in geoms if geom.name == "floor" or self.model.body(geom.bodyid[0]).name in bodies]
+        )
         self._parameters: dict[str, Tensor] = {}
         self._delay_steps: Tensor | None = None
         self._previous_target = torch.tensor(constants.DEFAULT_POSE).repeat(num_simulations, 1)
         self._warned = self._warning_count()
         self.unstable = torch.zeros(num_simulations, dtype=torch.bool)
-        self._qpos[:, 7:] = self._ctrl[:] = constants.DEFAULT_POSE
+        self._qpos[:, _JOINTS] = self._ctrl[:] = constants.DEFAULT_POSE
         self.batch.forward()
         self._read()
 
@@ -151,6 +170,8 @@ class BatchSimulator:
     ) -> None:
         """Put the rows of a bool mask ``[N]`` into given states; the other rows stay bit-identical.
 
+        Scenery stays as it is.
+
         Raises:
             ValueError: if a state is not finite; the engine would replace it without a word.
         """
@@ -163,8 +184,15 @@ class BatchSimulator:
         if not bool(finite.all()):
             rows = mask.nonzero()[:, 0][~finite].tolist()
             raise ValueError(f"the states of rows {rows[:8]} are not finite; look for NaN in what they come from")
+        angle, rate = self._qpos[ids][:, self._hinges], self._qvel[ids][:, self._hinge_speeds]
+        placed = (self._mocap_position[ids], self._mocap_quaternion[ids]) if self.scenery else None
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self._qpos[ids], self._qvel[ids] = qpos.numpy(), qvel.numpy()
+        if placed is not None:
+            self._mocap_position[ids], self._mocap_quaternion[ids] = placed
+        state, speed = self._qpos[ids], self._qvel[ids]
+        state[:, : _JOINTS.stop], speed[:, : _JOINT_SPEEDS.stop] = qpos.numpy(), qvel.numpy()
+        state[:, self._hinges], speed[:, self._hinge_speeds] = angle, rate
+        self._qpos[ids], self._qvel[ids] = state, speed
         self._ctrl[ids] = joint_position[mask].numpy()
         self._previous_target = torch.where(mask[:, None], joint_position, self._previous_target)
         self.batch.forward(ids)
@@ -172,13 +200,44 @@ class BatchSimulator:
         self.unstable = self.unstable & ~mask
         self._read()
 
+    def place(self, mask: Tensor, position: Tensor, quaternion: Tensor, hinge_angle: Tensor) -> None:
+        """Put the scenery of the rows of a bool mask ``[N]`` somewhere, hinges at rest; other rows are left alone.
+
+        Args:
+            mask: bool ``[N]``.
+            position: ``[N, P, 3]`` [m], one for each piece of :attr:`scenery`, world frame.
+            quaternion: ``[N, P, 4]`` (w, x, y, z).
+            hinge_angle: ``[N, H]`` [rad], one for each piece that has a hinge, in the same order.
+
+        Raises:
+            ValueError: if a shape is another or a number is not finite.
+        """
+        n, pieces = self.num_simulations, len(self.scenery)
+        expected = {"position": (n, pieces, 3), "quaternion": (n, pieces, 4), "hinge_angle": (n, len(self._hinges))}
+        given = {"position": position, "quaternion": quaternion, "hinge_angle": hinge_angle}
+        for name, value in given.items():
+            if tuple(value.shape) != expected[name]:
+                raise ValueError(f"{name} of the scenery must be {list(expected[name])}, got {list(value.shape)}")
+            if not bool(torch.isfinite(value[mask]).all()):
+                raise ValueError(f"{name} of the scenery is not finite; look for NaN in what it comes from")
+        ids = mask.numpy()
+        if not pieces or not ids.any():
+            return
+        self._mocap_position[ids], self._mocap_quaternion[ids] = position[mask].numpy(), quaternion[mask].numpy()
+        state, speed = self._qpos[ids], self._qvel[ids]
+        state[:, self._hinges], speed[:, self._hinge_speeds] = hinge_angle[mask].numpy(), 0.0
+        self._qpos[ids], self._qvel[ids] = state, speed
+        self.batch.forward(ids)
+        self._read()
+
     def _read(self) -> None:
         qpos = torch.from_numpy(self._qpos.astype(np.float32))
         qvel = torch.from_numpy(self._qvel.astype(np.float32))
-        self.root_position, self.root_quaternion, self.joint_position = qpos[:, :3], qpos[:, 3:7], qpos[:, 7:]
+        self.root_position, self.root_quaternion, self.joint_position = qpos[:, :3], qpos[:, 3:7], qpos[:, _JOINTS]
         self.root_linear_velocity, self.root_angular_velocity = qvel[:, :3], qvel[:, 3:6]
-        self.joint_velocity = qvel[:, 6:]
-        forces = torch.from_numpy(self._sensordata[:, :_NUM_FORCES].astype(np.float32))
+        self.joint_velocity = qvel[:, _JOINT_SPEEDS]
+        self.hinge_angle = qpos[:, self._hinges]
+        forces = torch.from_numpy(self._sensordata[:, _FORCES].astype(np.float32))
         self.contact_force = torch.linalg.vector_norm(forces.unflatten(-1, (-1, 3)), dim=-1)
 
     def _warning_count(self) -> np.ndarray:
@@ -227,7 +286,7 @@ class BatchSimulator:
     def _write(self, name: str, rows: np.ndarray, value: Tensor) -> None:
         batch, model = self.batch, self.model
         new = value.numpy()[rows]
-        trunk, floor = model.body("trunk").id, model.geom("floor").id
+        trunk = model.body("trunk").id
         if name == "stiffness":
             batch.expand("actuator_gainprm")[rows, :, 0] = new
             batch.expand("actuator_biasprm")[rows, :, 1] = -new
@@ -236,7 +295,7 @@ class BatchSimulator:
         elif name == "torque_limit":
             batch.expand("actuator_forcerange")[rows] = np.stack((-new, new), -1)
         elif name == "ground_friction":
-            batch.expand("geom_friction")[rows, floor, 0] = new[:, 0]
+            batch.expand("geom_friction")[np.ix_(rows, self._ground, np.array([0]))] = new[:, None]
         elif name == "trunk_mass_offset":
             nominal = model.body_mass[trunk]
             mass = nominal + new[:, 0]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 from torch import Tensor
+
+from agility_rl.simulation.scenery import Piece
 
 PARAMETERS: dict[str, tuple[int, str]] = {
     "stiffness": (12, "N m/rad"),
@@ -40,6 +43,8 @@ class Simulator(Protocol):
         joint_velocity: ``[N, 12]`` [rad/s].
         contact_force: ``[N, 17]`` [N], net force on each group of :data:`agility_rl.go2.constants.CONTACT_GROUPS`.
         unstable: bool ``[N]``, the engine reported divergence in the last step.
+        scenery: pieces that stand around the robot.
+        hinge_angle: ``[N, H]`` [rad], of the pieces that have a hinge.
 
     Example:
         >>> simulator: Simulator = make_simulator(num_simulations=1, num_threads=1)
@@ -60,6 +65,8 @@ class Simulator(Protocol):
     joint_velocity: Tensor
     contact_force: Tensor
     unstable: Tensor
+    scenery: Sequence[Piece]
+    hinge_angle: Tensor
 
     def step(self, target: Tensor) -> None:
         """Hold joint position targets ``[N, 12]`` [rad] for one control step."""
@@ -76,7 +83,11 @@ class Simulator(Protocol):
         joint_position: Tensor,
         joint_velocity: Tensor,
     ) -> None:
-        """Put the rows of a bool mask ``[N]`` into given states; the other rows stay bit-identical."""
+        """Put the rows of a bool mask ``[N]`` into given states; the other rows and the scenery stay bit-identical."""
+        ...
+
+    def place(self, mask: Tensor, position: Tensor, quaternion: Tensor, hinge_angle: Tensor) -> None:
+        """Put the scenery of the rows of a bool mask: ``[N, P, 3]`` [m], ``[N, P, 4]``, ``[N, H]`` [rad]."""
         ...
 
     def set_parameters(self, mask: Tensor, **fields: Tensor) -> None:

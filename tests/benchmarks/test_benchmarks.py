@@ -23,6 +23,12 @@ def test_env_step_prints_a_share_of_the_bare_engine(repository: Path) -> None:
 
 
 @pytest.mark.slow
+def test_agility_speed_prints_a_share_of_the_bare_engine(repository: Path) -> None:
+    output = run(repository, "benchmarks/agility_speed.py", "--robots=4", "--threads=1", "--rounds=1", "--steps=5")
+    assert "bare Batch.step" in output and output.count("% of bare") == 5
+
+
+@pytest.mark.slow
 def test_plain_loop_and_recipe_run_in_turns(repository: Path) -> None:
     output = run(repository, "benchmarks/plain_ppo.py", "--preset=smoke", "--robots=4", "--iterations=1", "--warmup=0")
     assert "speed of the recipe relative to the plain loop" in output and "nan" not in output

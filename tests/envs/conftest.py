@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from agility_rl.envs import LocomotionEnv
+from agility_rl.envs.agility_state import AgilityState
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants
 
@@ -55,5 +56,29 @@ def neutral() -> Callable[..., LocomotionState]:
             "dt": 0.02,
         }
         return LocomotionState(**(fields | changes))
+
+    return make
+
+
+@pytest.fixture
+def on_course(neutral: Callable[..., LocomotionState]) -> Callable[..., AgilityState]:
+    """Make the state of robots that stand one metre before their goal; fields given by name replace those."""
+
+    def make(n: int = 2, **changes: Any) -> AgilityState:
+        fields: dict[str, Any] = {
+            "robot": neutral(n),
+            "position": torch.tensor([0.0, 0.0, constants.STANDING_HEIGHT]).repeat(n, 1),
+            "velocity": torch.zeros(n, 2),
+            "goal_distance": torch.ones(n),
+            "goal_direction": torch.tensor([1.0, 0.0]).repeat(n, 1),
+            "heading_error": torch.zeros(n, 2),
+            "target_speed": torch.full((n,), 0.4),
+            "at_goal": torch.zeros(n, dtype=torch.bool),
+            "foot_on_edge": torch.zeros(n, 4, dtype=torch.bool),
+            "behaviours": torch.zeros(n, 3, dtype=torch.int64),
+            "parameters": torch.zeros(n, 2, 5, 6),
+            "applied": torch.zeros(n, 2, 6),
+        }
+        return AgilityState(**(fields | changes))
 
     return make

@@ -78,7 +78,7 @@ def test_errors_name_what_is_missing() -> None:
 
 def test_a_past_of_another_length_is_refused(build: Callable[..., LocomotionEnv]) -> None:
     given = states([0, 1, 2, 3, 4]).set("past_motion", torch.zeros(5, 7, 49))
-    with pytest.raises(ValueError, match="bring 7 past motion frames, expected 8; .* same motion offsets"):
+    with pytest.raises(ValueError, match=r"bring 7 past motion frames, expected 8; .* same motion offsets"):
         build(2, reference=given, motion_offsets=(0, 4, 8))
 
 

@@ -136,8 +136,8 @@ def test_what_cannot_change_in_a_run_is_refused(finished: Path) -> None:
 
 
 def test_a_gated_reward_is_paid_in_proportion_to_the_speed(module: Callable[[str], ModuleType]) -> None:
-    recipe, setup, config = module("bbc_pretrain"), module("bbc_setup"), module("bbc_config")
-    parts = setup.build(config.SMOKE)
+    recipe, setup, presets = module("bbc_pretrain"), module("bbc_setup"), module("bbc_presets")
+    parts = setup.build(presets.SMOKE)
     batch = parts.rollout.collect(parts.bbc.privileged_policy()).clone()
     share = recipe.speed_share(parts, batch)
     # the same number by hand: the velocity of the next state, which "explicit" of the following step shows
@@ -150,7 +150,7 @@ def test_a_gated_reward_is_paid_in_proportion_to_the_speed(module: Callable[[str
 
     def style_and_skill(gate: float) -> torch.Tensor:
         rewarded = batch.clone()
-        cfg = replace(config.SMOKE.imitation, gate=gate, task_reward=0.0, shift_reward=0.0)
+        cfg = replace(presets.SMOKE.imitation, gate=gate, task_reward=0.0, shift_reward=0.0)
         recipe.add_rewards(parts, cfg, rewarded, parts.env.dt)
         return rewarded["next", "reward"]
 

@@ -1,0 +1,163 @@
+"""The course around ``N`` robots: where they start, what they perceive of it, how far they have come."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from agility_rl import keys, rotations
+from agility_rl.envs.course import Course
+from agility_rl.envs.layout import CourseLayout
+from agility_rl.envs.obstacles import OBSTACLES
+from agility_rl.envs.progress import GOAL_RADIUS, CourseProgress
+from agility_rl.envs.robots import CLEARANCE
+from agility_rl.envs.scandots import HeightScan
+from agility_rl.go2 import constants
+from agility_rl.simulation import Simulator
+
+START_BEHIND, START_ASIDE, START_TURN = 0.2, 0.1, 0.2
+"""Draw of the start: 0 to 0.2 m behind the first way-point, +-0.1 m beside it, +-0.2 rad (method notes, 5.7)."""
+
+
+class Arena:
+    """A course, drawn for each robot, and the robots' progress on it.
+
+    Source: method notes, sections 5.4, 5.5, 5.7.
+
+    Args:
+        course: what stands where.
+        num_robots: N.
+        generator: source of randomness.
+        goal_radius: distance at which a way-point is reached [m].
+        start: before a random obstacle, or before the first.
+
+    Attributes:
+        layout: where the obstacles stand.
+        progress: current way-points.
+        scan: heights.
+        max_obstacles: most obstacles in an episode, from the one it starts before.
+        start_weights: ``[K]``, how often episodes start before each obstacle of the course.
+        types: bool ``[K, 7]``, one-hot type of each obstacle.
+
+    Raises:
+        ValueError: if ``start`` is something else.
+    """
+
+    def __init__(
+        self,
+        course: Course,
+        num_robots: int,
+        generator: torch.Generator,
+        goal_radius: float = GOAL_RADIUS,
+        start: Literal["random", "first"] = "random",
+    ) -> None:
+        if start not in ("random", "first"):
+            raise ValueError(f"expected start 'random' or 'first', got {start!r}")
+        self.generator, self.random_start = generator, start == "random"
+        self.layout = CourseLayout(course, num_robots, generator)
+        self.progress = CourseProgress(self.layout, goal_radius)
+        self.scan = HeightScan(self.layout)
+        kinds = self.layout.kinds
+        self.max_obstacles = len(kinds)
+        self.start_weights = torch.ones(len(kinds))
+        names = list(OBSTACLES)
+        self.types = torch.nn.functional.one_hot(
+            torch.tensor([names.index(kind.name) for kind in kinds]), len(names)
+        ).bool()
+        self._speeds = torch.tensor([kind.target_speed for kind in kinds])
+
+    def set_curriculum(self, difficulty: float | None, obstacles: int | None, start_weights: Tensor | None) -> None:
+        """Change what later episodes draw; what is ``None`` stays as it is.
+
+        Raises:
+            ValueError: if a value is outside its range.
+        """
+        count = len(self.layout.kinds)
+        if difficulty is not None:
+            if not 0.0 <= difficulty <= 1.0:
+                raise ValueError(f"difficulty must be in 0 to 1, got {difficulty}")
+            self.layout.difficulty = difficulty
+        if obstacles is not None:
+            if not 1 <= obstacles <= count:
+                raise ValueError(f"obstacles must be in 1 to {count}, got {obstacles}")
+            self.max_obstacles = obstacles
+        if start_weights is not None:
+            if start_weights.shape != (count,) or not bool((start_weights > 0.0).all()):
+                raise ValueError(f"start_weights must be {count} positive numbers, got {start_weights.tolist()}")
+            self.start_weights = start_weights.detach().clone()
+
+    def begin(self, mask: Tensor, simulator: Simulator) -> None:
+        """Draw the courses of the rows of a bool mask ``[N]`` and stand their robots before an obstacle."""
+        n = len(mask)
+        self.layout.draw(mask)
+        simulator.place(mask, *self.layout.poses())
+        length = self.layout.length
+        leg = torch.zeros(n, dtype=torch.int64)
+        if self.random_start:
+            valid = torch.arange(self.layout.route.shape[1]) < length[:, None]
+            weights = self.start_weights[self.layout.route] * valid
+            leg = torch.multinomial(weights, 1, generator=self.generator)[:, 0]
+        self.progress.begin(mask, leg, torch.minimum(leg + self.max_obstacles, length))
+
+        behind, aside, turn = torch.rand(3, n, generator=self.generator)
+        shift = torch.stack((-START_BEHIND * behind, START_ASIDE * (2.0 * aside - 1.0)), -1)
+        obstacle = self.progress.obstacle
+        place = self.layout.world(obstacle, self.progress.local_goal() + shift)
+        yaw = self.layout.yaw[torch.arange(n), obstacle] + START_TURN * (2.0 * turn - 1.0)
+        height = self.ground(place, simulator)[:, None] + constants.STANDING_HEIGHT + CLEARANCE
+        simulator.reset(
+            mask,
+            root_position=torch.cat((place, height), -1),
+            root_quaternion=rotations.from_euler(torch.zeros(n), torch.zeros(n), yaw),
+            root_linear_velocity=torch.zeros(n, 3),
+            root_angular_velocity=torch.zeros(n, 3),
+            joint_position=torch.tensor(constants.DEFAULT_POSE).repeat(n, 1),
+            joint_velocity=torch.zeros(n, constants.NUM_JOINTS),
+        )
+        self.progress.locate(mask, place)
+
+    def ground(self, position: Tensor, simulator: Simulator) -> Tensor:
+        """Height [m] of what robots stand on under horizontal positions ``[N, 2]``, as ``[N]``."""
+        parameter = self.layout.parameter(simulator.hinge_angle)
+        return simulator.ground_height(position) + self.scan.support(position[:, None], parameter)[:, 0]
+
+    def target_speed(self) -> Tensor:
+        """Speed towards the goal that is worth the full reward, ``[N]`` [m/s]."""
+        return self._speeds[self.progress.obstacle]
+
+    def heading_error(self, position: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor]:
+        """Vector to the current way-point ``[N, 2]`` [m] and angles to it and the next one ``[N, 2]`` [rad]."""
+        goals = torch.stack(self.progress.goals(), 1) - position[:, None]  # [N, 2 goals, 2]
+        return goals[:, 0], rotations.wrap_angle(torch.atan2(goals[..., 1], goals[..., 0]) - yaw[:, None])
+
+    def observe(self, simulator: Simulator, yaw: Tensor) -> TensorDict:
+        """What the Task-Specific Controller sees of the course, ``[N]``."""
+        parameter = self.layout.parameter(simulator.hinge_angle)
+        return TensorDict(
+            {
+                keys.HEADING_ERROR: self.heading_error(simulator.root_position[:, :2], yaw)[1],
+                keys.OBSTACLE: self.types[self.progress.obstacle].float(),
+                keys.SCANDOTS: self.scan.scandots(simulator.root_position, yaw, parameter),
+            },
+            [len(yaw)],
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything but the generator."""
+        return {
+            "layout": self.layout.state_dict(),
+            "progress": self.progress.state_dict(),
+            "max_obstacles": self.max_obstacles,
+            "start_weights": self.start_weights.clone(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.layout.load_state_dict(state["layout"])
+        self.progress.load_state_dict(state["progress"])
+        self.max_obstacles = state["max_obstacles"]
+        self.start_weights = state["start_weights"].clone()

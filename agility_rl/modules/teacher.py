@@ -1,0 +1,100 @@
+"""The Task-Specific Controller's teacher: encoders of what only a simulation knows, and the hybrid actor on top."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
+from torch import nn
+
+from agility_rl import keys
+from agility_rl.go2 import features
+from agility_rl.modules.adaptation import HistoryEncoder, PrivilegedEncoder
+from agility_rl.modules.behaviour_controller import NUM_LATENT
+from agility_rl.modules.estimator import StateEstimator
+from agility_rl.modules.hybrid_actor import HybridActor
+from agility_rl.modules.scandots import ScandotsEncoder
+
+NUM_HEADING = 2
+"""Heading errors to the current and to the next way-point (method notes, section 5.4)."""
+
+
+class Teacher(nn.Module):
+    """A behaviour and its parameters from proprioception, way-points, scandots and latent physical parameters.
+
+    As in :class:`~agility_rl.modules.BasicBehaviourController`, the latent comes from the simulator's truth
+    (:meth:`privileged_policy`) or from the history (:meth:`deployable_policy`).
+
+    Source: supplement S6; inputs: method notes, sections 5.3 and 5.4.
+
+    Keys read: ``proprioception`` [*B, 45], ``heading_error`` [*B, 2] [rad], ``obstacle`` [*B, 7], ``scandots``
+    [*B, 132] [m], and ``privileged`` [*B, 29] or ``history`` [*B, 10, 45].
+    Keys written: ``estimate`` [*B, 4], ``latent`` [*B, 29], ``terrain_latent`` [*B, 32], and those of
+    :class:`~agility_rl.modules.HybridActor`.
+
+    Args:
+        num_obstacles: types of obstacles in the one-hot.
+        hidden: sizes of the actor's hidden layers.
+        initial_std: standard deviation of the parameters at the start.
+        min_std: its floor.
+        allowed: indices of the behaviours that it may choose; ``None`` for all.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> teacher = Teacher()
+        >>> sizes = {"proprioception": 45, "heading_error": 2, "obstacle": 7, "scandots": 132, "privileged": 29}
+        >>> td = TensorDict({name: torch.zeros(3, size) for name, size in sizes.items()}, [3])
+        >>> teacher.privileged_policy()(td)["action", "parameters"].shape
+        torch.Size([3, 5, 6])
+    """
+
+    def __init__(
+        self,
+        num_obstacles: int = 7,
+        hidden: Sequence[int] = (512, 256, 128),
+        initial_std: float = 1.0,
+        min_std: float = 0.1,
+        allowed: Sequence[int] | None = None,
+    ) -> None:
+        super().__init__()
+        self.settings: dict[str, Any] = {
+            "num_obstacles": num_obstacles,
+            "hidden": list(hidden),
+            "initial_std": initial_std,
+            "min_std": min_std,
+            "allowed": None if allowed is None else list(allowed),
+        }
+        self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
+        self.privileged_encoder = PrivilegedEncoder(NUM_LATENT, NUM_LATENT)
+        self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
+        self.scandots_encoder = ScandotsEncoder()
+        inputs = {
+            keys.PROPRIOCEPTION: features.NUM_PROPRIOCEPTION,
+            keys.HEADING_ERROR: NUM_HEADING,
+            keys.OBSTACLE: num_obstacles,
+            keys.TERRAIN_LATENT: 32,
+            keys.ESTIMATE: features.NUM_EXPLICIT,
+            keys.LATENT: NUM_LATENT,
+        }
+        self.actor = HybridActor(
+            sum(inputs.values()),
+            in_keys=list(inputs),
+            hidden=hidden,
+            initial_std=initial_std,
+            min_std=min_std,
+            allowed=allowed,
+        )
+
+    def privileged_policy(self) -> TensorDictSequential:
+        """Policy for roll-outs in training: estimator, privileged encoder, scandots encoder, actor."""
+        return TensorDictSequential(self.estimator, self.privileged_encoder, self.scandots_encoder, self.actor)
+
+    def deployable_policy(self) -> TensorDictSequential:
+        """Policy that infers the physical parameters: estimator, history encoder, scandots encoder, actor."""
+        return TensorDictSequential(self.estimator, self.history_encoder, self.scandots_encoder, self.actor)
+
+    def trained_actor(self) -> ProbabilisticTensorDictSequential:
+        """Encoders and actor, as a PPO loss takes them; the estimate is an input, so PPO does not move it."""
+        return ProbabilisticTensorDictSequential(self.privileged_encoder, self.scandots_encoder, *self.actor)

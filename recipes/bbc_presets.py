@@ -1,0 +1,108 @@
+"""Presets of stage 1: ``paper`` as published, ``cpu`` tuned for two cores, ``quickstart`` and ``smoke`` cut from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from bbc_config import AdaptationConfig, Config, EnvConfig, ImitationConfig, MotionConfig, PPOConfig
+
+PAPER = Config(
+    motion=MotionConfig(mirror=False, standing_weight=1.0),
+    env=EnvConfig(
+        num_robots=4096,
+        terrain="rough",
+        action_delay=0.02,
+        action_delay_from=20_000,
+        jump_reward="window",
+        jump_weight=0.2,
+    ),
+    ppo=PPOConfig(minibatches=4),
+)
+CPU = Config(
+    iterations=1000,
+    max_minutes=58.0,
+    changes=(
+        (240, "imitation.imitation_reward", 4.0),
+        (240, "imitation.skill_reward", 2.0),
+        (350, "ppo.entropy", 0.0005),
+    ),
+    motion=MotionConfig(offsets=(0, 6, 12, 18, 24), standing_weight=0.0),
+    env=EnvConfig(
+        randomize=False,
+        push_interval=None,
+        observation_noise=0.0,
+        friction_loss=0.0,
+        collision_weight=-2.0,
+        episode_length=8.0,
+        progress_weight=8.0,
+        progress_fade=(120, 120),
+        progress_left=4.0,
+        jump_weight=16.0,
+        jump_width=0.03,
+    ),
+    ppo=PPOConfig(
+        epochs=4,
+        minibatches=8,
+        learning_rate=3e-4,
+        max_learning_rate=2e-3,
+        desired_kl=0.02,
+        gamma=0.98,
+        entropy=0.002,
+        initial_std=0.5,
+        hidden=(256, 128, 64),
+        critic_history=False,
+    ),
+    imitation=ImitationConfig(
+        conditional=True,
+        labelled_share=0.5,
+        minibatches=3,
+        batch_size=1024,
+        labelled_batch_size=512,
+        replay=400_000,
+        discriminator_learning_rate=1e-4,
+        encoder_learning_rate=3e-4,
+        gradient_penalty=5.0,
+        cloning=3000,
+        warm_up=300,
+        information=0.3,
+        information_ramp=(50, 300),
+        prior_weight=2e-3,
+        prior_temperature=100.0,
+        imitation_reward=2.0,
+        skill_reward=1.0,
+        skill_floor=-15.0,
+        gate=1.0,
+        task_reward=0.25,
+        height_deviation=0.06,
+        velocity_weight=0.1,
+    ),
+    adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
+)
+QUICKSTART = replace(
+    CPU,
+    name="quickstart",
+    iterations=110,
+    max_minutes=5.0,
+    env=replace(CPU.env, num_robots=512),
+    imitation=replace(CPU.imitation, cloning=500),
+)
+SMOKE = replace(
+    CPU,
+    name="smoke",
+    iterations=2,
+    checkpoint_every=1,
+    env=replace(CPU.env, num_robots=16),
+    ppo=replace(CPU.ppo, steps=8, epochs=1, minibatches=2, hidden=(32, 32)),
+    imitation=replace(
+        CPU.imitation,
+        cloning=5,
+        warm_up=5,
+        minibatches=2,
+        batch_size=32,
+        labelled_batch_size=32,
+        replay=2048,
+        hidden=(32, 32),
+    ),
+    adaptation=replace(CPU.adaptation, every=2),
+)
+PRESETS = {"smoke": SMOKE, "quickstart": QUICKSTART, "cpu": CPU, "paper": PAPER}

@@ -1,0 +1,150 @@
+"""Options and presets of the recipe that trains the Task-Specific Controller's teacher.
+
+``paper`` holds Table S4 to the number, and the released code's values where it is silent; ``cpu`` is for two cores.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    course: str = "full"
+    """Name of a preset course (``full``, ``tunnel``, ``box``, ``hurdles``, ...), or a course file."""
+    num_robots: int = 512
+    decision_steps: int = 1
+    """Control steps of a decision; 1 decides at 50 Hz (method notes, section 5.1)."""
+    randomize: bool = True
+    """Friction, mass, centre of mass and one step of action delay (method notes, section 5.11)."""
+    push_interval: float | None = 8.0
+    """Seconds (method notes, section 5.11)."""
+    command_noise: tuple[float, float] = (0.8, 1.2)
+    """Factors on every command (method notes, section 5.1)."""
+    episode_length: float = 40.0
+    """Seconds (method notes, section 5.6)."""
+    num_threads: int | None = None
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    steps: int = 24
+    epochs: int = 5
+    minibatches: int = 4
+    learning_rate: float = 5e-4
+    """Table S4."""
+    max_learning_rate: float = 1e-2
+    desired_kl: float | None = 0.01
+    """Of the continuous part (method notes, sections 3.7 and 5.2)."""
+    clip: float = 0.2
+    """Table S4."""
+    gamma: float = 0.99
+    """Table S4."""
+    lmbda: float = 0.95
+    """Table S4."""
+    continuous: Literal["all", "selected"] = "all"
+    """Which continuous dimensions count (``all``: method notes, section 5.2)."""
+    entropy: float = 0.01
+    """Of both parts (method notes, section 5.2)."""
+    value: float = 1.0
+    max_grad_norm: float = 1.0
+    initial_std: float = 1.0
+    min_std: float = 0.1
+    hidden: tuple[int, ...] = (512, 256, 128)
+    """Supplement S6."""
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    task: float = 2.0
+    """Table S4."""
+    imitation: float = 0.2
+    """Table S4, times the time step; needs the discriminator of the BBC's run."""
+
+
+@dataclass(frozen=True)
+class AdaptationConfig:
+    learning_rate: float = 1e-4
+    every: int = 20
+    """Iterations between roll-outs that use the history encoder (released code)."""
+    minibatches: int = 8
+    privileged: float = 0.1
+    privileged_ramp: tuple[int, int] = (500, 1000)
+    """First iteration and length (method notes, section 5.9)."""
+
+
+@dataclass(frozen=True)
+class CurriculumConfig:
+    success: float = 0.8
+    """Success rate at which a robot meets harder courses (method notes, section 5.7)."""
+    episodes: int = 500
+    """Finished episodes over which it is measured."""
+    difficulty: float = 0.0
+    """Share of the range of heights at the start; 1 is the released difficulty at once."""
+    difficulty_step: float = 0.1
+    obstacles: int = 1
+    """Obstacles of an episode at the start; one more whenever the difficulty is full. 6 or more: all at once."""
+    practice: float = 1.0
+    """How much more often an episode starts before an obstacle that fails: weight 1 + this * failure / success."""
+
+
+@dataclass(frozen=True)
+class Config:
+    name: str = "teacher"
+    """Folder under ``runs``."""
+    runs: Path = Path("runs")
+    seed: int = 0
+    bbc: Path = Path("pretrained/bbc")
+    """Run or artifact folder of the Basic Behaviour Controller."""
+    iterations: int = 30_000
+    """Released code (method notes, section 5.9)."""
+    max_minutes: float | None = None
+    """Stop and save after this time."""
+    checkpoint_every: int = 50
+    resume: Path | None = None
+    """Run folder to go on with."""
+    init_from: Path | None = None
+    """Run or artifact folder whose teacher to start from."""
+    behaviours: tuple[str, ...] = ("walk", "pace", "trot", "canter", "jump")
+    """Behaviours that it may choose; the others are never drawn."""
+    env: EnvConfig = field(default_factory=EnvConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    adaptation: AdaptationConfig = field(default_factory=AdaptationConfig)
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+
+
+PAPER = Config(
+    env=EnvConfig(num_robots=6144),
+    curriculum=CurriculumConfig(difficulty=1.0, obstacles=6, practice=0.0),
+)
+CPU = Config(
+    iterations=3000,
+    max_minutes=180.0,
+    env=EnvConfig(num_robots=256, decision_steps=5, randomize=False, push_interval=None),
+    ppo=PPOConfig(
+        steps=24,
+        minibatches=4,
+        max_learning_rate=2e-3,
+        desired_kl=0.02,
+        gamma=0.97,
+        entropy=0.005,
+        continuous="selected",
+        hidden=(256, 128, 64),
+        initial_std=0.5,
+    ),
+    adaptation=AdaptationConfig(learning_rate=1e-3, minibatches=4),
+)
+SMOKE = replace(
+    CPU,
+    name="smoke_teacher",
+    iterations=2,
+    checkpoint_every=1,
+    env=replace(CPU.env, num_robots=8, decision_steps=2),
+    ppo=replace(CPU.ppo, steps=4, epochs=1, minibatches=2, hidden=(32, 32)),
+    adaptation=replace(CPU.adaptation, every=2, minibatches=2),
+    curriculum=replace(CPU.curriculum, episodes=1),
+)
+PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}

@@ -1,0 +1,271 @@
+"""What a run of stage 3 is made of: course, frozen controller, networks, losses, optimisers, and the artifact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from rollouts import Controller, load_controller
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import KLAdaptiveLR
+from torchrl.objectives.value import GAE
+from tsc_config import Config, CurriculumConfig
+
+from agility_rl import keys
+from agility_rl.behaviours import BEHAVIOURS, skill_index
+from agility_rl.deploy.artifact import Artifact, build_manifest
+from agility_rl.envs import COURSES, AgilityEnv, Course, load_course
+from agility_rl.envs.agility import COURSE_RANDOMIZATION
+from agility_rl.envs.obstacles import OBSTACLES
+from agility_rl.go2 import features
+from agility_rl.losses import AdaptationLoss, HybridPPOLoss
+from agility_rl.modules import Critic, Discriminator, FeatureNormalizer, Teacher
+from agility_rl.training.checkpoint import RunCheckpoint
+from agility_rl.training.ppo import PPOUpdate
+from agility_rl.training.rollout import Rollout
+from agility_rl.training.seeding import Seeds, seed_everything
+
+OBSERVED = (
+    *(keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.HISTORY),
+    *(keys.HEADING_ERROR, keys.OBSTACLE, keys.SCANDOTS),
+)
+"""What the critic reads (method notes, section 5.4: all of it)."""
+
+
+@dataclass
+class Curriculum:
+    """Harder courses as soon as the present ones are mastered.
+
+    Attributes:
+        cfg: when, and by how much.
+        difficulty: share of the range of heights.
+        obstacles: most obstacles of an episode.
+        passed, failed: ``[7]``, moving averages of how often each type was passed and failed.
+        successes, episodes: finished since the last step.
+    """
+
+    cfg: CurriculumConfig
+    difficulty: float
+    obstacles: int
+    most: int
+    passed: Tensor = field(default_factory=lambda: torch.ones(len(OBSTACLES)))
+    failed: Tensor = field(default_factory=lambda: torch.ones(len(OBSTACLES)))
+    successes: int = 0
+    episodes: int = 0
+
+    def update(self, passed: Tensor, failed: Tensor, successes: int, episodes: int) -> None:
+        """Count what an iteration has finished, and take a step if it is time."""
+        keep = 0.98
+        self.passed, self.failed = keep * self.passed + passed, keep * self.failed + failed
+        self.successes, self.episodes = self.successes + successes, self.episodes + episodes
+        if self.episodes < self.cfg.episodes:
+            return
+        if self.successes / self.episodes >= self.cfg.success:
+            if self.difficulty < 1.0:
+                self.difficulty = min(1.0, self.difficulty + self.cfg.difficulty_step)
+            else:
+                self.obstacles = min(self.most, self.obstacles + 1)
+        self.successes = self.episodes = 0
+
+    def start_weights(self, types: Tensor) -> Tensor:
+        """``[K]``, how often to start before each obstacle, from one-hot types ``[K, 7]``."""
+        rate = self.passed / (self.passed + self.failed)
+        return 1.0 + self.cfg.practice * ((1.0 - rate) / rate.clamp(min=0.1))[types.float().argmax(-1)]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where it stands."""
+        names = ("difficulty", "obstacles", "passed", "failed", "successes", "episodes")
+        return {name: getattr(self, name) for name in names}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        for name, value in state.items():
+            setattr(self, name, value)
+
+
+@dataclass
+class Components:
+    """Everything a run is made of."""
+
+    seeds: Seeds
+    env: AgilityEnv
+    teacher: Teacher
+    critic: Critic
+    discriminator: Discriminator | None
+    curriculum: Curriculum
+    rollout: Rollout
+    advantage: GAE
+    adaptation_loss: AdaptationLoss
+    policy_optimizer: torch.optim.Optimizer
+    adaptation_optimizer: torch.optim.Optimizer
+    ppo: PPOUpdate
+    bbc: Controller
+
+    @property
+    def generator(self) -> torch.Generator:
+        """Source of minibatch order."""
+        return self.seeds.generator("batches")
+
+    def checkpoint(self, folder: Path, progress: dict[str, float]) -> RunCheckpoint:
+        """All that a bit-exact continuation needs; what is frozen comes from its own artifact."""
+        names = ("seeds", "env", "teacher", "critic", "curriculum", "rollout")
+        names += ("policy_optimizer", "adaptation_optimizer")
+        return RunCheckpoint(folder, progress=progress, **{name: getattr(self, name) for name in names})
+
+
+def build(cfg: Config) -> Components:
+    """Construct course, environment, networks, losses and optimisers."""
+    seeds, ppo = seed_everything(cfg.seed), cfg.ppo
+    controller = load_controller(cfg.bbc)
+    discriminator, offsets = load_discriminator(controller.run, cfg.reward.imitation > 0.0)
+    env = make_env(cfg, controller, seed=seeds.integer("environment"), motion_offsets=offsets)
+    allowed = None if set(cfg.behaviours) == set(BEHAVIOURS) else sorted(skill_index(name) for name in cfg.behaviours)
+    teacher = Teacher(len(OBSTACLES), ppo.hidden, ppo.initial_std, ppo.min_std, allowed)
+    teacher.estimator.load_state_dict(controller.bbc.estimator.state_dict())  # method notes, section 5.3
+    width = sum(env.observation_spec[key].shape[1:].numel() for key in OBSERVED)
+    critic = Critic(width, in_keys=list(OBSERVED), hidden=ppo.hidden)
+    trained = teacher.trained_actor()
+    policy_optimizer = torch.optim.Adam(
+        [
+            *(*teacher.privileged_encoder.parameters(), *teacher.scandots_encoder.parameters()),
+            *(*teacher.actor.parameters(), *critic.parameters()),
+        ],
+        lr=ppo.learning_rate,
+        fused=True,
+    )
+    loss = HybridPPOLoss(
+        trained,
+        critic,
+        continuous=ppo.continuous,
+        clip_epsilon=ppo.clip,
+        critic_coeff=ppo.value,
+        discrete_entropy_coeff=ppo.entropy,
+        continuous_entropy_coeff=ppo.entropy,
+    )
+
+    def divergence(sample: TensorDictBase) -> Tensor:
+        teacher.actor.project_std()
+        return loss.divergence(sample)["continuous"]  # of this part alone: method notes, section 5.2
+
+    schedule = None
+    if ppo.desired_kl is not None:
+        schedule = KLAdaptiveLR(policy_optimizer, ppo.desired_kl, max_lr=ppo.max_learning_rate)
+    adaptation_loss = AdaptationLoss(teacher.history_encoder, teacher.privileged_encoder)
+    outcome = [keys.OUTCOME, keys.TERMINATIONS, keys.REWARD_TERMS, keys.MOTION, keys.SKILL, keys.OBSTACLE]
+    return Components(
+        seeds=seeds,
+        env=env,
+        teacher=teacher,
+        critic=critic,
+        discriminator=discriminator,
+        curriculum=Curriculum(
+            cfg.curriculum,
+            cfg.curriculum.difficulty,
+            min(cfg.curriculum.obstacles, len(env.arena.layout.kinds)),
+            len(env.arena.layout.kinds),
+        ),
+        rollout=Rollout(
+            env,
+            ppo.steps,
+            keep=[*OBSERVED, keys.ESTIMATE, keys.ACTION, "logits", "loc", "scale"],
+            keep_next=["reward", *outcome],
+            value=lambda observation: critic(observation.select(*OBSERVED))["state_value"],
+        ),
+        advantage=GAE(gamma=ppo.gamma, lmbda=ppo.lmbda, value_network=None, time_dim=0),
+        adaptation_loss=adaptation_loss,
+        policy_optimizer=policy_optimizer,
+        adaptation_optimizer=torch.optim.Adam(
+            teacher.history_encoder.parameters(), lr=cfg.adaptation.learning_rate, fused=True
+        ),
+        ppo=PPOUpdate(
+            loss,
+            policy_optimizer,
+            epochs=ppo.epochs,
+            minibatches=ppo.minibatches,
+            max_grad_norm=ppo.max_grad_norm,
+            keep=["logits", "loc", "scale", keys.HISTORY, keys.PRIVILEGED],
+            divergence=divergence,
+            schedule=schedule,
+        ),
+        bbc=controller,
+    )
+
+
+def make_env(cfg: Config, controller: Controller, **options: Any) -> AgilityEnv:
+    """The course with the frozen controller in it."""
+    env = cfg.env
+    return AgilityEnv(
+        env.num_robots,
+        frozen(controller),
+        course_of(env.course),
+        simulator_options={"num_threads": env.num_threads, "friction_loss": controller.friction_loss},
+        decision_steps=env.decision_steps,
+        command_noise=env.command_noise,
+        randomization=COURSE_RANDOMIZATION if env.randomize else None,
+        episode_length=env.episode_length,
+        push_interval=env.push_interval,
+        **options,
+    )
+
+
+def frozen(controller: Controller) -> Callable[[TensorDictBase], TensorDictBase]:
+    """The Basic Behaviour Controller as an environment calls it: deterministic, from what the robot measures."""
+    policy = controller.bbc.deployable_policy()
+
+    def act(observation: TensorDictBase) -> TensorDictBase:
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return policy(observation)
+
+    return act
+
+
+def course_of(name: str) -> Course:
+    """A preset course, or one of a file.
+
+    Raises:
+        ValueError: if there is neither.
+    """
+    if name in COURSES:
+        return COURSES[name]
+    if Path(name).suffix:
+        return load_course(name)
+    raise ValueError(f"unknown course {name!r}; expected one of {', '.join(COURSES)}, or a .toml or .json file")
+
+
+def load_discriminator(run: Path, wanted: bool) -> tuple[Discriminator | None, tuple[int, ...]]:
+    """The discriminator that ``bbc_pretrain.py`` left beside its policy, and which frames it looks at."""
+    folder = run / "discriminator"
+    if not wanted or not folder.is_dir():
+        if wanted:
+            print(f"{run} holds no discriminator: there is no imitation reward")
+        return None, features.MOTION_OFFSETS
+    artifact = Artifact.load(folder, kind="discriminator")
+    network = artifact.manifest["network"]
+    size = features.NUM_MOTION
+    discriminator = Discriminator(
+        horizon=len(network["offsets"]),
+        hidden=network["hidden"],
+        normalizer=FeatureNormalizer(torch.zeros(size), torch.ones(size)),
+        num_skills=network["num_skills"],
+    )
+    discriminator.load_state_dict(artifact.state)
+    return discriminator.requires_grad_(False), tuple(network["offsets"])
+
+
+def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
+    """Write the teacher as an artifact, with what is needed to run it elsewhere."""
+    manifest = build_manifest(
+        "teacher",
+        {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT},
+        control_period=parts.env.dt * cfg.env.decision_steps,
+        data=[],
+    )
+    manifest["network"] = parts.teacher.settings
+    manifest["bbc"] = parts.bbc.artifact.manifest["weights"]["sha256"]
+    manifest["course"] = cfg.env.course
+    Artifact.save(folder / "policy", parts.teacher.state_dict(), manifest)

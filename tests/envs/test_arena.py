@@ -1,0 +1,121 @@
+"""Starts, curriculum and what is perceived of the course."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from agility_rl import keys, rotations
+from agility_rl.envs.arena import Arena
+from agility_rl.envs.course_presets import COURSES
+from agility_rl.simulation import BatchSimulator
+
+N = 60
+
+
+def build(course: str = "full", n: int = N, **options: Any) -> tuple[Arena, BatchSimulator]:
+    arena = Arena(COURSES[course], n, torch.Generator().manual_seed(0), **options)
+    return arena, BatchSimulator(n, num_threads=1, scenery=arena.layout.pieces)
+
+
+def begin(arena: Arena, simulator: BatchSimulator) -> None:
+    arena.begin(torch.ones(simulator.num_simulations, dtype=torch.bool), simulator)
+
+
+def test_robots_start_before_a_random_obstacle_and_face_it() -> None:
+    arena, simulator = build()
+    begin(arena, simulator)
+    assert torch.bincount(arena.progress.leg, minlength=6).min() > 2
+    goal = arena.progress.local_goal()
+    offset = arena.progress.local - goal
+    assert offset[:, 0].min() >= -0.2 - 1e-5 and offset[:, 0].max() <= 1e-5 and offset[:, 0].std() > 0.04
+    assert offset[:, 1].abs().max() <= 0.1 + 1e-5 and offset[:, 1].std() > 0.04
+    yaw = rotations.to_euler(simulator.root_quaternion)[2]
+    rows = torch.arange(N)
+    turn = rotations.wrap_angle(yaw - arena.layout.yaw[rows, arena.progress.obstacle])
+    assert turn.abs().max() <= 0.2 + 1e-5 and turn.std() > 0.08
+    assert torch.equal(arena.progress.end, arena.layout.length)
+    assert (simulator.contact_force[:, :1] == 0.0).all()  # nobody starts inside something
+
+
+def test_a_start_before_the_first() -> None:
+    arena, simulator = build(start="first")
+    begin(arena, simulator)
+    assert (arena.progress.leg == 0).all()
+    with pytest.raises(ValueError, match="'random' or 'first', got 'last'"):
+        build(start="last")
+
+
+def test_curriculum() -> None:
+    arena, simulator = build(n=400)
+    weights = torch.tensor([1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1.0])
+    arena.set_curriculum(0.0, 2, weights)
+    begin(arena, simulator)
+    assert (arena.progress.obstacle == 5).all()
+    assert ((arena.progress.end - arena.progress.leg) <= 2).all() and (arena.progress.end <= 6).all()
+    bar = [kind.name for kind in arena.layout.kinds].index("bar_jump")
+    assert (arena.layout.lift[:, bar] == torch.tensor(0.05)).all()
+    arena.set_curriculum(None, None, None)
+    assert arena.max_obstacles == 2 and arena.layout.difficulty == 0.0
+    for bad, message in (
+        ((2.0, None, None), "difficulty"),
+        ((None, 7, None), "1 to 6"),
+        ((None, None, -weights), "positive"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            arena.set_curriculum(*bad)
+
+
+def test_routes_of_other_lengths() -> None:
+    arena, simulator = build("bidirectional")
+    begin(arena, simulator)
+    assert (arena.progress.leg < arena.layout.length).all()
+
+
+def test_heading_errors_by_hand() -> None:
+    arena, simulator = build("tunnel", n=1)
+    begin(arena, simulator)
+    layout = arena.layout
+    layout.position, layout.yaw = torch.tensor([[[2.0, 3.5]]]), torch.tensor([[math.pi / 2]])
+    # Goals lie at y = 3.5 - 2.025 and 3.5 - 1.525; the robot stands left of the line and looks along x.
+    goal, error = arena.heading_error(torch.tensor([[1.0, 1.475]]), torch.tensor([0.0]))
+    torch.testing.assert_close(goal, torch.tensor([[1.0, 0.0]]))
+    torch.testing.assert_close(error, torch.tensor([[0.0, math.atan2(0.5, 1.0)]]))
+    _, behind = arena.heading_error(torch.tensor([[3.0, 1.475]]), torch.tensor([0.5]))
+    torch.testing.assert_close(behind[:, 0], torch.tensor([math.pi - 0.5]))
+
+
+def test_observation() -> None:
+    arena, simulator = build()
+    begin(arena, simulator)
+    yaw = rotations.to_euler(simulator.root_quaternion)[2]
+    seen = arena.observe(simulator, yaw)
+    assert seen[keys.OBSTACLE].shape == (N, 7) and (seen[keys.OBSTACLE].sum(-1) == 1.0).all()
+    names = [arena.layout.kinds[index].name for index in arena.progress.obstacle.tolist()]
+    expected = ["bar_jump", "a_frame", "weave_poles", "seesaw", "tire_jump", "tunnel"]
+    assert [expected[index] for index in seen[keys.OBSTACLE].argmax(-1).tolist()] == names
+    speed = torch.tensor([2.5 if name in ("bar_jump", "tire_jump") else 0.4 for name in names])
+    assert torch.equal(arena.target_speed(), speed)
+    assert seen[keys.SCANDOTS].shape == (N, 132) and seen[keys.HEADING_ERROR].abs().max() <= math.pi
+
+
+def test_the_ground_is_what_carries() -> None:
+    arena, simulator = build("a_frame", n=2)
+    begin(arena, simulator)
+    top = arena.layout.position[:, 0]
+    torch.testing.assert_close(arena.ground(top, simulator), torch.full((2,), 0.333), atol=3e-3, rtol=0)
+    assert (arena.ground(top + 1.9, simulator) == 0.0).all()
+
+
+def test_saved_arena_is_exact() -> None:
+    arena, simulator = build(n=5)
+    arena.set_curriculum(0.5, 3, torch.arange(1.0, 7.0))
+    begin(arena, simulator)
+    other, _ = build(n=5)
+    other.load_state_dict(arena.state_dict())
+    assert torch.equal(other.progress.goal(), arena.progress.goal())
+    assert other.max_obstacles == 3 and other.layout.difficulty == 0.5
+    assert torch.equal(other.start_weights, arena.start_weights)

@@ -1,0 +1,110 @@
+"""The recipe of stage 3 on a few robots, called in this process: a start of Python costs more than the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+
+from agility_rl.deploy.artifact import Artifact
+from agility_rl.envs.obstacles import OBSTACLES
+from agility_rl.modules import Teacher
+from agility_rl.record.mcap_logger import read_scalars
+
+Module = Callable[[str], ModuleType]
+
+
+@pytest.fixture
+def recipe(module: Module) -> ModuleType:
+    return module("tsc_teacher")
+
+
+@pytest.fixture
+def smoke(recipe: ModuleType, untrained: Path, tmp_path: Path) -> Any:
+    cfg = recipe.PRESETS["smoke"]
+    env = replace(cfg.env, num_threads=1)
+    return replace(cfg, runs=tmp_path, bbc=untrained, env=env, reward=replace(cfg.reward, imitation=0.0))
+
+
+def test_a_run_writes_what_the_next_stage_needs(recipe: ModuleType, smoke: Any, untrained: Path) -> None:
+    run = recipe.train(smoke)
+    artifact = Artifact.load(run / "policy", kind="teacher")
+    assert artifact.manifest["control_period"] == pytest.approx(0.04)  # decides every second control step
+    assert artifact.manifest["bbc"] == Artifact.load(untrained / "policy").manifest["weights"]["sha256"]
+    teacher = Teacher(**artifact.manifest["network"])
+    teacher.load_state_dict(artifact.state)
+    scalars = read_scalars(run)
+    for name in ("reward/task", "task/heading", "use/trot", "success/tunnel", "curriculum/obstacles", "kl_discrete"):
+        assert bool(scalars[name][1].isfinite().all()), name
+    use = sum(scalars[f"use/{name}"][1] for name in ("walk", "pace", "trot", "canter", "jump"))
+    torch.testing.assert_close(use, torch.ones_like(use), atol=1e-6, rtol=0)
+
+
+def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smoke: Any) -> None:
+    whole = recipe.train(replace(smoke, name="whole", iterations=4))
+    halves = recipe.train(replace(smoke, name="halves", iterations=2))
+    recipe.train(replace(smoke, resume=halves, iterations=4))
+    one, other = (Artifact.load(run / "policy").state for run in (whole, halves))
+    assert not [name for name in one if not torch.equal(one[name], other[name])]
+    for name in ("reward/task", "loss_critic", "use/jump"):
+        assert torch.equal(read_scalars(whole)[name][1], read_scalars(halves)[name][1]), name
+
+
+def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
+    parent = recipe.train(replace(smoke, iterations=1))
+    child = recipe.train(replace(smoke, name="child", iterations=1, init_from=parent))
+    assert Artifact.load(child / "policy").manifest["course"] == "full"
+    alone = recipe.train(
+        replace(smoke, name="trot", behaviours=("trot",), env=replace(smoke.env, course="box"), iterations=1)
+    )
+    scalars = read_scalars(alone)
+    assert scalars["use/trot"][1].tolist() == [1.0]
+    assert "success/box_jump" in scalars and "success/tunnel" not in scalars
+
+
+def test_the_curriculum_by_hand(module: Module) -> None:
+    setup, config = module("tsc_setup"), module("tsc_config")
+    cfg = config.CurriculumConfig(success=0.8, episodes=10, difficulty_step=0.5, practice=2.0)
+    curriculum = setup.Curriculum(cfg, 0.0, 1, most=3)
+    nothing = torch.zeros(len(OBSTACLES))
+    steps = []
+    for successes in (8, 7, 9, 10, 10, 10):  # of ten each: up, stays, full difficulty, then one obstacle more at a time
+        curriculum.update(nothing, nothing, successes, 10)
+        steps.append((curriculum.difficulty, curriculum.obstacles))
+    assert steps == [(0.5, 1), (0.5, 1), (1.0, 1), (1.0, 2), (1.0, 3), (1.0, 3)]
+    curriculum.passed, curriculum.failed = torch.ones(len(OBSTACLES)), torch.zeros(len(OBSTACLES))
+    curriculum.failed[2] = 3.0  # a success rate of a quarter
+    weights = curriculum.start_weights(torch.nn.functional.one_hot(torch.tensor([0, 2]), len(OBSTACLES)))
+    assert weights.tolist() == pytest.approx([1.0, 1.0 + 2.0 * 3.0])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--env.course", "nowhere"), "unknown course 'nowhere'; expected one of full"),
+        (("--env.course", "nowhere.toml"), "nowhere.toml: cannot be read"),
+        (("--behaviours", "trot", "gallop"), "unknown gallop"),
+        (("--bbc", "nowhere"), "nowhere"),
+        (("--env.num-robot", "3"), "did you mean --env.num-robots"),
+    ],
+)
+def test_bad_options_give_one_clear_line(
+    recipe: ModuleType,
+    tmp_path: Path,
+    untrained: Path,
+    capsys: pytest.CaptureFixture[str],
+    options: tuple[str, ...],
+    message: str,
+) -> None:
+    arguments = ["smoke", "--runs", str(tmp_path), "--bbc", str(untrained), "--reward.imitation", "0", *options]
+    with pytest.raises(SystemExit) as stop, recipe.cli.one_line_errors():
+        recipe.train(recipe.cli.from_presets(recipe.PRESETS, arguments))
+    assert stop.value.code == 2
+    errors = capsys.readouterr().err
+    assert message in errors and errors.count("\n") == 1
+    assert not (tmp_path / "smoke_teacher").exists()
