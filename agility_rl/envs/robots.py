@@ -17,10 +17,12 @@ from agility_rl.simulation import Simulator
 
 PEAK_WINDOW = 0.9
 """Seconds over which the highest trunk position counts for a jump."""
+STRIDE = 0.5
+"""Time constant over which a robot's velocity is averaged [s]: a dog does not walk at a constant speed."""
 CLEARANCE = 0.005
 """Height added at a reset, so that no foot starts in the ground [m]."""
 
-_BUFFERS = ("action", "torque", "joint_velocity", "heights", "privileged", "stiffness", "damping")
+_BUFFERS = ("action", "torque", "joint_velocity", "mean_velocity", "heights", "privileged", "stiffness", "damping")
 
 
 class Robots:
@@ -56,6 +58,7 @@ class Robots:
         self._default_pose = torch.tensor(constants.DEFAULT_POSE)
         self._action_scale = torch.tensor(constants.ACTION_SCALE)
         self.action, self.torque, self.joint_velocity = (torch.zeros(n, constants.NUM_JOINTS) for _ in range(3))
+        self.mean_velocity = torch.zeros(n, 3)
         self.heights = torch.zeros(n, round(PEAK_WINDOW / self.dt))
         fields, self.privileged = sample_parameters(n, NOMINAL, generator)
         self.stiffness, self.damping = fields["stiffness"], fields["damping"]
@@ -64,6 +67,7 @@ class Robots:
         """Hold joint targets ``q_default + scale * action`` for one control step."""
         self.simulator.step(self._default_pose + self._action_scale * action)
         self.heights = torch.cat((self.heights[:, 1:], self._height()), -1)
+        self.mean_velocity = torch.lerp(self.mean_velocity, self._velocity(), self.dt / STRIDE)
 
     def remember(self, state: LocomotionState) -> None:
         """Keep of a step's state what the next one compares with."""
@@ -75,6 +79,7 @@ class Robots:
         self.action = self.action.masked_fill(row, 0.0)
         self.joint_velocity = torch.where(row, self.simulator.joint_velocity, self.joint_velocity)
         self.heights = torch.where(row, self._height(), self.heights)
+        self.mean_velocity = torch.where(row, self._velocity(), self.mean_velocity)
         state = self.state(self.action, commands)
         self.torque = torch.where(row, state.torque, self.torque)
         return state
@@ -92,6 +97,9 @@ class Robots:
         position = self.simulator.root_position
         return position[:, 2:] - self.ground(position[:, :2])[:, None]
 
+    def _velocity(self) -> Tensor:
+        return rotations.rotate_inverse(self.simulator.root_quaternion, self.simulator.root_linear_velocity)
+
     def state(self, action: Tensor, commands: CommandSampler) -> LocomotionState:
         """The present, as the terms of an environment see it."""
         simulator = self.simulator
@@ -104,7 +112,8 @@ class Robots:
             roll=roll,
             pitch=pitch,
             yaw=yaw,
-            linear_velocity=rotations.rotate_inverse(simulator.root_quaternion, simulator.root_linear_velocity),
+            linear_velocity=self._velocity(),
+            mean_velocity=self.mean_velocity,
             angular_velocity=simulator.root_angular_velocity,
             joint_position=simulator.joint_position,
             joint_velocity=simulator.joint_velocity,

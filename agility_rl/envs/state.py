@@ -17,6 +17,7 @@ class LocomotionState:
         pitch: ``[N]`` [rad].
         yaw: ``[N]`` [rad].
         linear_velocity: ``[N, 3]`` [m/s], base frame.
+        mean_velocity: ``[N, 3]`` [m/s], base frame, averaged over the last 0.5 s with exponential weights.
         angular_velocity: ``[N, 3]`` [rad/s], base frame.
         joint_position: ``[N, 12]`` [rad].
         joint_velocity: ``[N, 12]`` [rad/s].
@@ -42,6 +43,7 @@ class LocomotionState:
     pitch: Tensor
     yaw: Tensor
     linear_velocity: Tensor
+    mean_velocity: Tensor
     angular_velocity: Tensor
     joint_position: Tensor
     joint_velocity: Tensor

@@ -40,10 +40,10 @@ CASES: list[tuple[str, dict[str, Any], float]] = [
     ("linear_velocity", {"command": COMMAND, "linear_velocity": torch.tensor([[0.5, 0.0, 9.0]])}, 0.3134862),
     ("linear_velocity", {"command": COMMAND, "linear_velocity": torch.tensor([[1.0, 0.2, 0.0]])}, 1.0),
     # along the command: (1.0 * 0.5 + 0.2 * 0.1) / sqrt(1.04), half of its sqrt(1.04); 1.5 times it misses by half too
-    ("velocity_progress", {"command": COMMAND, "linear_velocity": torch.tensor([[0.5, 0.1, 9.0]])}, 0.5),
-    ("velocity_progress", {"command": COMMAND, "linear_velocity": torch.tensor([[1.5, 0.3, 0.0]])}, 0.5),
+    ("velocity_progress", {"command": COMMAND, "mean_velocity": torch.tensor([[0.5, 0.1, 9.0]])}, 0.5),
+    ("velocity_progress", {"command": COMMAND, "mean_velocity": torch.tensor([[1.5, 0.3, 0.0]])}, 0.5),
     ("velocity_progress", {"command": 0.05 * COMMAND}, 1.0 - 0.05 * 1.04**0.5 / 0.1),
-    ("velocity_progress", {"command": COMMAND, "linear_velocity": torch.tensor([[-9.0, 0.0, 0.0]])}, -1.0),
+    ("velocity_progress", {"command": COMMAND, "mean_velocity": torch.tensor([[-9.0, 0.0, 0.0]])}, -1.0),
     ("velocity_progress", {"command": COMMAND}, 0.0),
     ("velocity_progress", {"command": 0.0 * COMMAND}, 1.0),
     # error 0.5 rad/s: exp(-1)

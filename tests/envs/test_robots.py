@@ -7,7 +7,7 @@ import torch
 
 from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.randomization import Randomization
-from agility_rl.envs.robots import PEAK_WINDOW, Pushes, Robots
+from agility_rl.envs.robots import PEAK_WINDOW, STRIDE, Pushes, Robots
 from agility_rl.go2 import constants
 from agility_rl.simulation import make_simulator
 
@@ -42,6 +42,20 @@ def test_heights_count_from_the_given_ground_and_peaks_last_their_window() -> No
     torch.testing.assert_close(robots.state(robots.action, commands).peak_height, start)
     robots.step(torch.zeros(2, 12))
     assert (robots.state(robots.action, commands).peak_height < start).all()  # it has sunk into its springs
+
+
+def test_the_mean_velocity_follows_with_its_time_constant_and_starts_with_the_robot() -> None:
+    robots, commands = build(1)
+    robots.begin(torch.ones(1, dtype=torch.bool), commands)
+    mean = robots.state(robots.action, commands).linear_velocity
+    for _ in range(10):
+        robots.step(torch.zeros(1, 12))
+        state = robots.state(torch.zeros(1, 12), commands)
+        mean = mean + 0.02 / STRIDE * (state.linear_velocity - mean)
+        torch.testing.assert_close(state.mean_velocity, mean)
+    robots.begin(torch.ones(1, dtype=torch.bool), commands)
+    state = robots.state(robots.action, commands)
+    assert torch.equal(state.mean_velocity, state.linear_velocity)
 
 
 def test_randomising_some_leaves_the_others() -> None:
