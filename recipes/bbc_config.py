@@ -16,6 +16,8 @@ class MotionConfig:
     """Folder of unlabelled clips."""
     mirror: bool = True
     """Add the left-right mirrored motion."""
+    one_sided: tuple[str, ...] = ()
+    """Behaviours whose labelled clips are not mirrored."""
     offsets: tuple[int, ...] = (0, 1)
     """Frames that the discriminator sees together, in control steps from the oldest (Table S1: two consecutive)."""
     standing_weight: float = 0.1
@@ -176,7 +178,7 @@ class Config:
     adaptation: AdaptationConfig = field(default_factory=AdaptationConfig)
 
 
-CHANGEABLE = ("ppo.entropy", "env.jump_weight")
+CHANGEABLE = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight")
 CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
 """Options that may change during a run."""
 

@@ -206,6 +206,8 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
 
     cfg = at(cfg, iteration)
     parts.ppo.loss.entropy_coeff.fill_(cfg.ppo.entropy)
+    if parts.ppo.schedule is not None:
+        parts.ppo.schedule.target_kl = cfg.ppo.desired_kl
     jump = parts.env.rewards["jump_height"]
     parts.env.rewards["jump_height"] = jump._replace(weight=cfg.env.jump_weight)
     if term := parts.env.rewards.get("velocity_progress"):

@@ -242,7 +242,12 @@ def load_motion(cfg: MotionConfig, seed: int) -> MotionDataset:
     else:
         labelled, unlabelled = load_clips(cfg.labelled, label="from name"), load_clips(cfg.unlabelled)
     return MotionDataset(
-        labelled, unlabelled, offsets=cfg.offsets, mirror=cfg.mirror, standing_weight=cfg.standing_weight
+        labelled,
+        unlabelled,
+        offsets=cfg.offsets,
+        mirror=cfg.mirror,
+        standing_weight=cfg.standing_weight,
+        one_sided=cfg.one_sided,
     )
 
 

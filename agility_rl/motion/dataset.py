@@ -5,7 +5,7 @@ Every clip is turned into frames once; a sample is a gather from one tensor, wha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -71,6 +71,8 @@ class MotionDataset:
         dt: seconds between two frames of a sample [s]; clips of another rate are resampled.
         offsets: which frames a sample holds, in frames from its first.
         mirror: also draw from the mirror image of every clip, each with half its weight.
+        one_sided: labels whose labelled clips are not mirrored: a canter has a leading leg, and who is shown it on
+            both sides may end between them, in a bound.
         features: maps a clip to the features of its frames.
         standing_weight: factor on the weight of unlabelled frames in which the dog stands, which a dog does a third of
             the time: mean speed of the second around them below 0.1 m/s.
@@ -100,6 +102,7 @@ class MotionDataset:
         mirror: bool = False,
         features: FrameFeatures = discriminator_frames,
         standing_weight: float = 1.0,
+        one_sided: Collection[str] = (),
     ) -> None:
         if not unlabelled:
             raise MotionError(
@@ -121,7 +124,7 @@ class MotionDataset:
         }
         self._unlabelled_seconds = sum(clip.num_frames * dt for clip in unlabelled)
         if mirror:
-            labelled, unlabelled = _with_mirror_images(labelled), _with_mirror_images(unlabelled)
+            labelled, unlabelled = _with_mirror_images(labelled, one_sided), _with_mirror_images(unlabelled)
         self.labelled_clips = tuple(labelled)
         self._labelled = self._pool(labelled, [BEHAVIOURS.index(str(clip.label)) for clip in labelled], features)
         self._unlabelled = self._pool(unlabelled, [0] * len(unlabelled), features)
@@ -287,7 +290,13 @@ def _standing(clip: MotionClip) -> Tensor:
     return torch.nn.functional.avg_pool1d(padded, window, stride=1)[0, 0] < STANDING_SPEED
 
 
-def _with_mirror_images(clips: Sequence[MotionClip]) -> list[MotionClip]:
-    """Every clip and its mirror image next to it, with half the weight each."""
-    halves = [replace(clip, weight=clip.weight / 2) for clip in clips]
-    return [image for clip in halves for image in (clip, mirror_clip(clip))]
+def _with_mirror_images(clips: Sequence[MotionClip], but: Collection[str] = ()) -> list[MotionClip]:
+    """Every clip and its mirror image next to it, with half the weight each; clips with some labels as they are."""
+    images = []
+    for clip in clips:
+        if clip.label in but:
+            images.append(clip)
+        else:
+            half = replace(clip, weight=clip.weight / 2)
+            images += [half, mirror_clip(half)]
+    return images

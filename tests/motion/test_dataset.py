@@ -165,6 +165,16 @@ def test_mirror_images_halve_the_weight_and_balance_left_and_right(
     assert (states["root_angular_velocity"][:, 2] > 0).float().mean() == pytest.approx(0.5, abs=0.06)
 
 
+def test_one_sided_labels_have_no_mirror_image(clips: dict[str, MotionClip], generator: torch.Generator) -> None:
+    labelled = [clips["walk"], replace(clips["walk"], label="canter")]
+    dataset = MotionDataset(labelled, [clips["free"]], mirror=True, one_sided=("canter",))
+    assert [clip.label for clip in dataset.labelled_clips] == ["walk", "walk", "canter"]
+    assert [clip.weight for clip in dataset.labelled_clips] == [0.5, 0.5, 1.0]
+    states = dataset.sample_states(torch.tensor([0] * 500 + [3] * 500), generator)
+    turning = states["root_angular_velocity"][:, 2] > 0
+    assert turning[500:].all() and not turning[:500].all()
+
+
 def test_features_are_those_of_the_policy(make_clip: ClipMaker) -> None:
     clip = make_clip()
     frames = discriminator_frames(clip)
