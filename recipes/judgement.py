@@ -86,31 +86,35 @@ def print_evaluation(found: Mapping[str, Any], console: Console) -> None:
     """Print the tables of an evaluation."""
     source = found["motion"]["source"]
     console.print(f"compared with {source}" + (", synthetic" if found["motion"]["synthetic"] else ""), highlight=False)
-    matrix = _table("shown by the robot, shares of episodes", "commanded", *found["matrix"]["columns"])
+    matrix = make_table("shown by the robot, shares of episodes", "commanded", *found["matrix"]["columns"])
     for name, counts in zip(BEHAVIOURS, found["matrix"]["counts"].tolist(), strict=True):
         matrix.add_row(name, *(f"{count / sum(counts):.2f}" if count else "." for count in counts))
     console.print(matrix)
-    table = _table("mean errors of an episode, without falls", "commanded", *found["episodes"]["quantities"], "falls")
+    table = make_table(
+        "mean errors of an episode, without falls", "commanded", *found["episodes"]["quantities"], "falls"
+    )
     for name, entry in found["behaviours"].items():
         errors = [show(entry["errors"].get(key)) for key in found["episodes"]["quantities"]]
         table.add_row(name, *errors, show(entry["falls"]))
     console.print(table)
     if found["switches"]:
         trials = found["switches"]["trials"]
-        table = _table(f"switches without a fall, of {trials} (second behaviour recognised)", "from / to", *BEHAVIOURS)
+        table = make_table(
+            f"switches without a fall, of {trials} (second behaviour recognised)", "from / to", *BEHAVIOURS
+        )
         for first in BEHAVIOURS:
             keys = ["" if first == second else f"{first} to {second}" for second in BEHAVIOURS]
             safe, known = found["switches"]["without_fall"], found["switches"]["second_recognised"]
             table.add_row(first, *(f"{safe[key]} ({known[key]})" if key else "" for key in keys))
         console.print(table)
     if found["prior"]:
-        table = _table("skill prior", "", *BEHAVIOURS)
+        table = make_table("skill prior", "", *BEHAVIOURS)
         for key in ("learned", "unlabelled_among_behaviours"):
             table.add_row(key.replace("_", " "), *(f"{share:.2f}" for share in found["prior"][key].values()))
         console.print(table)
         seconds = ", ".join(f"{name} {value:.0f} s" for name, value in found["prior"]["unlabelled_seconds"].items())
         console.print(f"unlabelled motion by the gait classifier: {seconds}", highlight=False)
-    table = _table("targets, with 95 % intervals", "what", "measured", "target", "")
+    table = make_table("targets, with 95 % intervals", "what", "measured", "target", "")
     for row in found["targets"]:
         verdict = "[green]pass[/]" if row["passed"] else "[red]FAIL[/]"
         table.add_row(row["name"], show(row["value"]), row["target"], verdict)
@@ -142,7 +146,8 @@ def to_json(value: Any) -> Any:
     return cli.to_json(value)
 
 
-def _table(title: str, *columns: str) -> Table:
+def make_table(title: str, *columns: str) -> Table:
+    """An empty table; its first column is text, the others are numbers."""
     table = Table(title=title, title_justify="left")
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index == 0 else "right", no_wrap=True)

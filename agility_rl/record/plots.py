@@ -45,7 +45,7 @@ def learning_curves(
         raise ValueError(f"no run has any of {', '.join(names)}; they have {', '.join(sorted(known)) or 'nothing'}")
     columns = max(1, min(columns, len(names)))
     rows = -(-len(names) // columns)
-    figure = _figure(4.2 * columns, 2.8 * rows)
+    figure = new_figure(4.2 * columns, 2.8 * rows)
     for index, name in enumerate(names):
         axes = figure.add_subplot(rows, columns, index + 1)
         for number, (label, curves) in enumerate(runs.items()):
@@ -84,7 +84,7 @@ def footfall_diagram(contact: Tensor, dt: float, *, title: str = "") -> Figure:
     """
     if contact.ndim != 2 or contact.shape[1] != len(LEGS):
         raise ValueError(f"expected contacts [T, {len(LEGS)}], got {list(contact.shape)}")
-    figure = _figure(8.0, 2.2)
+    figure = new_figure(8.0, 2.2)
     axes = figure.add_subplot()
     edge = torch.zeros(1, dtype=torch.int8)
     for foot, leg in enumerate(LEGS):
@@ -120,7 +120,7 @@ def behaviour_matrix(counts: Tensor, names: Sequence[str], columns: Sequence[str
     if counts.shape != (len(names), len(columns)):
         raise ValueError(f"expected counts [{len(names)}, {len(columns)}] for the labels, got {list(counts.shape)}")
     shares = (counts.double() / counts.sum(1, keepdim=True).clamp(min=1)).cpu().numpy()
-    figure = _figure(1.8 + 0.8 * len(columns), 1.4 + 0.6 * len(names))
+    figure = new_figure(1.8 + 0.8 * len(columns), 1.4 + 0.6 * len(names))
     axes = figure.add_subplot()
     axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
     for row, column in np.ndindex(*shares.shape):
@@ -151,7 +151,7 @@ def tracking_plot(commanded: Mapping[str, Tensor], measured: Mapping[str, Tensor
     """
     if missing := [name for name in commanded if name not in measured]:
         raise KeyError(f"{missing} were commanded, not measured; measured are {list(measured)}")
-    figure = _figure(8.0, 2.0 * len(commanded))
+    figure = new_figure(8.0, 2.0 * len(commanded))
     for index, (name, wanted) in enumerate(commanded.items()):
         axes = figure.add_subplot(len(commanded), 1, index + 1)
         time = torch.arange(wanted.numel()) * dt
@@ -181,8 +181,8 @@ def save_figure(figure: Figure, path: str | Path) -> Path:
     return path
 
 
-def _figure(width: float, height: float) -> Figure:
-    # No pyplot: it keeps every figure of a long run in memory and wants a display.
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of a size [inches], without pyplot: it keeps every figure of a long run, and wants a display."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

@@ -1,0 +1,192 @@
+"""Measure a Task-Specific Controller on courses: does the robot pass them, how fast, and with which behaviours?
+
+In:  a run folder of ``tsc_teacher.py`` or its ``policy/`` folder; or no teacher but a script, one behaviour at one
+     speed that turns towards the way-points: a baseline that needs only a Basic Behaviour Controller.
+Out: tables on the screen, ``RUN/course_evaluation.json``, ``RUN/figures/course_*.png``; an earlier one is replaced.
+
+    python recipes/evaluate_course.py runs/my_teacher                    # the course that it was trained on
+    python recipes/evaluate_course.py runs/my_teacher --course targets   # full, each obstacle alone, box, hurdles
+    python recipes/evaluate_course.py --script trot:1.2 --course each --episodes 50
+
+Courses: a preset, a .toml or .json file, ``each`` for every obstacle of the challenge alone, or ``targets``.
+Every episode has a course of its own at the released difficulty, starts before the first obstacle, and is driven by the
+deterministic deployable teacher (history encoder) with the frozen BBC, without noise on its commands.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from course_judgement import behaviour_seconds, print_courses, summarise, targets
+from course_pictures import typical, view
+from course_rollouts import Decider, Episode, load_script, load_teacher, record_episodes, shares
+from judgement import to_json
+from rich.console import Console
+from rich.progress import Progress
+from torch import Tensor
+from tsc_setup import course_of, frozen
+
+from agility_rl.envs import AgilityEnv, Course
+from agility_rl.envs.agility import COURSE_RANDOMIZATION
+from agility_rl.envs.course_presets import CHALLENGE
+from agility_rl.envs.obstacles import OBSTACLES
+from agility_rl.envs.randomization import NOMINAL
+from agility_rl.go2.constants import CONTROL_DT
+from agility_rl.record.course_plots import behaviour_use, plan_view
+from agility_rl.record.plots import save_figure
+from agility_rl.training import cli
+
+GROUPS = {"each": CHALLENGE, "targets": ("full", *CHALLENGE, "box", "hurdles")}
+"""Names that stand for several courses; the second holds all that stage 3 has a target for."""
+RANDOMIZATIONS = {
+    "none": None,
+    "friction": replace(NOMINAL, friction=COURSE_RANDOMIZATION.friction),
+    "training": COURSE_RANDOMIZATION,
+}
+"""What is drawn anew for each episode; ``friction`` is what the release evaluates with (method notes, section 8)."""
+
+
+@dataclass(frozen=True)
+class Config:
+    run: Annotated[Path | None, tyro.conf.Positional] = None
+    """Run or artifact folder of a teacher."""
+    script: str | None = None
+    """BEHAVIOUR:SPEED, such as trot:1.2 [m/s], in place of a teacher."""
+    bbc: Path | None = None
+    """Folder of the Basic Behaviour Controller: that of the training by default, for a script the pretrained one."""
+    course: tuple[str, ...] = ()
+    """Courses; by default the one that the teacher was trained on, for a script ``full``."""
+    episodes: int = 500
+    """Episodes of each course."""
+    robots: int = 125
+    """Most robots simulated at once; each of them runs its share of the episodes from start to end."""
+    behaviours: tuple[str, ...] | None = None
+    """Behaviours that the teacher may choose, by default all that it was trained with."""
+    goal_radius: float = 0.45
+    """Distance at which a way-point is reached [m]; the release trains with 0.4 and evaluates with 0.45."""
+    episode_length: float = 40.0
+    """Seconds until an episode counts as failed."""
+    randomization: Literal["none", "friction", "training"] = "none"
+    """Nominal robot and ground; drawn friction; or friction, mass, centre of mass and delay as in training."""
+    push_interval: float | None = None
+    """Seconds between pushes (training of the paper: 8)."""
+    noise: float = 0.0
+    """Factor on the observation noise (training: 0)."""
+    seed: int = 1000
+    """Seed of courses and start places; training draws its own from another generator, so none of them was seen."""
+    num_threads: int | None = None
+    """Threads of the simulator."""
+    output: Path | None = None
+    """Folder of the results; by default the run, for a script ``runs/script_BEHAVIOUR_SPEED``."""
+
+
+def simulate(course: Course, decider: Decider, config: Config, progress: Callable[[], object]) -> list[Episode]:
+    """All episodes of one course."""
+    quota = shares(config.episodes, config.robots)
+    env = AgilityEnv(
+        len(quota),
+        frozen(decider.controller),
+        course,
+        simulator_options={"num_threads": config.num_threads, "friction_loss": decider.controller.friction_loss},
+        decision_steps=1,
+        command_noise=(1.0, 1.0),
+        randomization=RANDOMIZATIONS[config.randomization],
+        observation_noise=config.noise,
+        episode_length=config.episode_length,
+        goal_radius=config.goal_radius,
+        start="first",
+        push_interval=config.push_interval,
+        seed=config.seed,
+    )
+    episodes = record_episodes(env, decider, quota, progress)
+    env.close()
+    return episodes
+
+
+def names(config: Config, decider: Decider) -> list[str]:
+    """Courses to run, each once, groups taken apart.
+
+    Raises:
+        ValueError: if there is no such course.
+    """
+    wanted: dict[str, None] = {}
+    for name in config.course or (decider.course,):
+        wanted |= dict.fromkeys(GROUPS.get(name, (name,)))
+    return list(wanted)
+
+
+def check(config: Config) -> None:
+    """Refuse impossible options before anything is loaded."""
+    if config.episodes < 1 or config.robots < 1 or config.episode_length < CONTROL_DT or config.goal_radius <= 0.0:
+        raise ValueError("expected --episodes and --robots of at least 1, --episode-length and --goal-radius above 0")
+    if config.push_interval is not None and config.push_interval < CONTROL_DT:
+        raise ValueError(f"expected --push-interval of at least {CONTROL_DT} s, got {config.push_interval}")
+    if (config.run is None) == (config.script is None):
+        raise ValueError("expected either the folder of a teacher or --script BEHAVIOUR:SPEED, such as trot:1.2")
+    if config.script is not None and config.behaviours is not None:
+        raise ValueError("--behaviours limits a teacher; a script has one behaviour already")
+
+
+def evaluate(config: Config, console: Console) -> dict[str, Any]:
+    """The whole evaluation; writes it and returns it."""
+    check(config)
+    begin = time.monotonic()
+    if config.run is not None:
+        decider = load_teacher(config.run, config.bbc, config.behaviours)
+    else:
+        decider = load_script(str(config.script), config.bbc)
+    courses = {name: course_of(name) for name in names(config, decider)}
+    output = config.output or decider.run or Path("runs") / decider.name
+    found: dict[str, Any] = {}
+    use: dict[str, Tensor] = {}
+    with Progress(console=console, transient=True) as bar:
+        for name, course in courses.items():
+            task = bar.add_task(name, total=config.episodes)
+            episodes = simulate(course, decider, config, lambda: bar.advance(task))  # noqa: B023 (called at once)
+            found[name] = summarise(course, episodes)
+            figure = plan_view([view(course, episode, config.goal_radius) for episode in typical(episodes)])
+            save_figure(figure, output / "figures" / f"course_{Path(name).stem}.png")
+            seconds = behaviour_seconds(episodes)
+            for index, obstacle in enumerate(OBSTACLES):
+                if seconds[index].sum() > 0.0:
+                    label = obstacle if obstacle == name else f"{Path(name).stem}: {obstacle}"
+                    use[label.replace("_", " ")] = seconds[index]
+    save_figure(behaviour_use(use), output / "figures" / "course_behaviours.png")
+    result = {
+        "format": "agility_rl.course_evaluation",
+        "format_version": 1,
+        "run": decider.name,
+        "weights": decider.weights,
+        "bbc": decider.controller.artifact.manifest["weights"]["sha256"],
+        "decision_period": decider.decision_steps * CONTROL_DT,
+        "behaviours": decider.behaviours,
+        "settings": config,
+        "versions": cli.versions(),
+        "courses": found,
+        "targets": targets(found),
+        "seconds": time.monotonic() - begin,
+    }
+    cli.write_json(output / "course_evaluation.json", to_json(result))
+    print_courses(result, console)
+    where = output / "course_evaluation.json"
+    console.print(f"{where} and figures written after {result['seconds']:.0f} s", highlight=False)
+    return result
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    config = tyro.cli(Config, args=arguments, description=__doc__)
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=160)  # a pipe has no width: do not fold the tables to 80 columns
+    with cli.one_line_errors():
+        evaluate(config, console)
+
+
+if __name__ == "__main__":
+    main()
