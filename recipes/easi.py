@@ -3,7 +3,7 @@
 Source: Fu et al. 2025, supplement S2, Algorithm S2, Table S3; method notes, section 6.
 
 In:  a robot log (``--log FILE``) and the policy that made it (``--policy RUN``; without one, the open-loop trot of
-     ``record_log.py``).
+     ``record_log.py``). The preset ``cpu`` replays the log; of the policy it takes only the friction of the joints.
 Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap`` (the distribution of every generation), ``checkpoints/``,
      ``result.json``, ``figures/convergence.png``, and the identifiability table on the screen.
 
@@ -11,7 +11,7 @@ Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap`` (the distribution of 
     python recipes/easi.py cpu --log logs/target.mcap --policy runs/my_run --truth logs/target.truth.json
     python recipes/easi.py cpu --resume runs/easi --generations 80      # goes on exactly where it stopped
 
-Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper`` (Table S3).
+Presets: ``smoke`` (seconds), ``cpu`` (two cores, ours), ``paper`` (Table S3).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from easi_config import PRESETS, Config, CriticConfig
+from easi_config import PRESETS, Config, CriticConfig, replay_window
 from easi_report import (
     draw_convergence,
     identify,
@@ -35,13 +35,22 @@ from easi_report import (
     survivor_correlation,
     write_result,
 )
-from log_policy import checksum, make_actor
+from log_policy import Actor, checksum, make_actor
 from rich.console import Console
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from agility_rl.collectors import EASICollector, EvolutionStrategy, ParameterSpace, RobotLog, one_thread
+from agility_rl.collectors import (
+    EASICollector,
+    EvolutionStrategy,
+    ParameterSpace,
+    ReplayCollector,
+    RobotLog,
+    cut_windows,
+    one_thread,
+)
 from agility_rl.collectors.parameters import Parameter
+from agility_rl.collectors.replay import MATCHED
 from agility_rl.losses import TransitionDiscriminatorLoss
 from agility_rl.modules import TransitionDiscriminator
 from agility_rl.record import MCAPLogger, read_scalars
@@ -51,7 +60,9 @@ from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.display import Display
 from agility_rl.training.seeding import Seeds, seed_everything
 
-HEADLINE = ("time/minutes", "error/mean", "distance", "score/mean", "score/best", "falls_per_minute")
+REPLAYED_AT_ONCE = 5
+"""Windows that every individual plays at the same time; more only takes memory. It does not change the result."""
+HEADLINE = ("time/minutes", "error/mean", "distance", "score/mean", "score/best")
 
 
 @dataclass
@@ -63,7 +74,7 @@ class Components:
     space: ParameterSpace
     search: EvolutionStrategy
     simulator: Simulator
-    collector: EASICollector
+    collector: EASICollector | ReplayCollector
     critic: TransitionDiscriminator
     loss: TransitionDiscriminatorLoss
     optimizer: torch.optim.Optimizer
@@ -84,10 +95,14 @@ def build(cfg: Config) -> Components:
     """Read the log, construct simulations, search and critic."""
     if cfg.log is None:
         raise ValueError("give --log FILE, a robot log in .mcap, .csv or .npz; record_log.py makes one")
+    if cfg.critic.matched and cfg.collection != "replay":
+        raise ValueError(
+            "--critic.matched needs --collection replay: a roll-out of the policy has no matching transition"
+        )
     if cfg.generations < 1 or cfg.trajectory_length < 1 or cfg.noise < 0.0 or cfg.critic.updates < 1:
         raise ValueError("expected --generations, --trajectory-length and --critic.updates from 1, and --noise from 0")
     seeds, search = seed_everything(cfg.seed), cfg.search
-    real = RobotLog.load(cfg.log).transitions()
+    log = RobotLog.load(cfg.log)
     linear = {"scale": "linear"} if search.scale == "linear" else {}
     space = ParameterSpace([Parameter.named(name, span=search.span, **linear) for name in search.parameters])
     actor = make_actor(cfg.policy, cfg.behaviours, cfg.command_seconds)
@@ -105,15 +120,27 @@ def build(cfg: Config) -> Components:
         for name, value in recording.items():
             if recorded.get(name) != value:
                 print(f"warning: the log was recorded with {name} {recorded.get(name)}, the search has {value}")
+    at_once = REPLAYED_AT_ONCE if cfg.collection == "replay" else 1
     simulator = make_simulator(
-        num_simulations=cfg.num_robots, num_threads=cfg.num_threads, friction_loss=recording["friction_loss"]
+        num_simulations=at_once * cfg.num_robots, num_threads=cfg.num_threads, friction_loss=recording["friction_loss"]
     )
     low, high = torch.zeros(len(space)), torch.ones(len(space))
     lower, upper = (low, high) if search.bounded else space.limits
-    critic = TransitionDiscriminator.from_transitions(real, hidden=cfg.critic.hidden, difference=cfg.critic.difference)
+    collector = make_collector(cfg, simulator, space, actor, log, seeds)
+    real = collector.real if isinstance(collector, ReplayCollector) else log.transitions()
+    critic = TransitionDiscriminator.from_transitions(
+        real,
+        clip=cfg.critic.clip,
+        hidden=cfg.critic.hidden,
+        difference=cfg.critic.difference,
+        matched_key=MATCHED if cfg.critic.matched else None,
+    )
     loss = TransitionDiscriminatorLoss(
         critic, weight_clip=cfg.critic.weight_clip, gradient_penalty=cfg.critic.gradient_penalty
     )
+    optimizer: torch.optim.Optimizer = torch.optim.RMSprop(critic.parameters(), lr=cfg.critic.learning_rate)
+    if cfg.critic.optimizer == "adam":
+        optimizer = torch.optim.Adam(critic.parameters(), lr=cfg.critic.learning_rate, betas=(0.5, 0.9))
     return Components(
         seeds=seeds,
         real=real,
@@ -131,22 +158,40 @@ def build(cfg: Config) -> Components:
             generator=seeds.generator("search"),
         ),
         simulator=simulator,
-        collector=EASICollector(
-            simulator,
-            space,
-            actor.policy,
-            generator=seeds.generator("collector"),
-            num_steps=cfg.trajectory_length,
-            noise=cfg.noise,
-            latency=cfg.latency,
-        ),
+        collector=collector,
         critic=critic,
         loss=loss,
-        optimizer=torch.optim.RMSprop(critic.parameters(), lr=cfg.critic.learning_rate),
+        optimizer=optimizer,
         survivors=torch.zeros(len(space), len(space), dtype=torch.float64),
         truth=truth,
         inputs={"log": checksum(cfg.log), **recording},
     )
+
+
+def make_collector(
+    cfg: Config, simulator: Simulator, space: ParameterSpace, actor: Actor, log: RobotLog, seeds: Seeds
+) -> EASICollector | ReplayCollector:
+    """What individuals do: roll out the policy, or replay the log.
+
+    Raises:
+        ValueError: if a trajectory is shorter than a window, or windows do not fit into the log.
+    """
+    generator = seeds.generator("collector")
+    if cfg.collection == "policy":
+        return EASICollector(
+            simulator,
+            space,
+            actor.policy,
+            generator=generator,
+            num_steps=cfg.trajectory_length,
+            noise=cfg.noise,
+            latency=cfg.latency,
+        )
+    steps, skip = replay_window(cfg)
+    if not 1 <= steps <= cfg.trajectory_length:
+        raise ValueError(f"expected --window from 1 to --trajectory-length {cfg.trajectory_length}, got {steps}")
+    windows = cut_windows(log, steps, skip=skip, noise=cfg.noise, latency=cfg.latency)
+    return ReplayCollector(simulator, space, windows, num_windows=cfg.trajectory_length // steps, generator=generator)
 
 
 @one_thread()
@@ -154,6 +199,8 @@ def update_critic(parts: Components, cfg: CriticConfig, transitions: TensorDictB
     """Algorithm S2, lines 9 to 12: K steps down equation (13); returns the last losses."""
     generator = parts.seeds.generator("batches")
     losses = TensorDict()
+    if cfg.matched:
+        parts.critic.rescale(transitions)
     for _ in range(cfg.updates):
         policy = parts.collector.sample(transitions, generator, cfg.batch_per_robot)
         rows = torch.randint(len(parts.real), (len(policy),), generator=generator)
@@ -185,7 +232,8 @@ def evolve(parts: Components, cfg: Config) -> dict[str, float]:
         error = relative_error(mean, parts.truth, parts.space)
         metrics |= {f"error/{name}": value for name, value in zip(parts.space.names, error)}
         metrics["error/mean"] = error.mean()
-    metrics["falls_per_minute"] = transitions["next", "fallen"].float().mean() * 60.0 / parts.simulator.control_dt
+    if ("next", "fallen") in transitions.keys(include_nested=True):  # who replays the log is never put back
+        metrics["falls_per_minute"] = transitions["next", "fallen"].float().mean() * 60.0 / parts.simulator.control_dt
     metrics["unusable_transitions"] = (~transitions["collector", "mask"]).float().mean()
     metrics |= {"time/collect": collected - clock, "time/critic": time.perf_counter() - collected}
     return {name: float(value) for name, value in metrics.items()}

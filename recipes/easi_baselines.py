@@ -36,11 +36,10 @@ import torch
 from easi_methods import METHODS, Problem, identify
 from easi_report import load_truth, relative_error
 from easi_table import markdown, print_table, summarize
-from easi_windows import cut_windows
 from log_policy import make_actor
 from rich.console import Console
 
-from agility_rl.collectors import GAINS, ParameterSpace, RobotLog
+from agility_rl.collectors import GAINS, ParameterSpace, RobotLog, cut_windows
 from agility_rl.collectors.parameters import Parameter
 from agility_rl.training import cli
 from agility_rl.training.seeding import Seeds

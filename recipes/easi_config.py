@@ -1,7 +1,8 @@
 """Options and presets of the search for the simulator that explains a robot log.
 
-``paper`` holds Table S3 to the number, and the values of EASI's release (method notes, section 6) where it is silent;
-``cpu`` is cut down for two cores.
+``paper`` holds Table S3 to the number, and the values of EASI's release (method notes, section 6) where it is silent:
+individuals roll out the policy. ``cpu`` is ours, for two cores: individuals replay windows of the log, and the critic
+sees by how much they miss it.
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ class SearchConfig:
 class CriticConfig:
     updates: int = 10
     """Updates in a generation, K (Table S3)."""
+    optimizer: Literal["rmsprop", "adam"] = "rmsprop"
+    """``rmsprop``: Table S3; ``adam`` with momenta 0.5 and 0.9, as is usual with a gradient penalty."""
     learning_rate: float = 3e-4
-    """Of RMSprop (Table S3)."""
+    """Table S3."""
     hidden: tuple[int, ...] = (128, 128)
     """EASI's release (method notes, section 6.2)."""
     weight_clip: float | None = 0.01
@@ -47,6 +50,10 @@ class CriticConfig:
     """Instead of, or beside, clipped weights (ours)."""
     difference: bool = False
     """Show the critic s' - s instead of s' (ours)."""
+    matched: bool = False
+    """Show the critic s' - s'_R, what the robot did after the same s and a; needs ``--collection replay`` (ours)."""
+    clip: float = 10.0
+    """Bound of the critic's normalised inputs; a small one silences windows whose estimated start is far off (ours)."""
     batch_per_robot: int = 16
     """Transitions of every simulation in an update, and as many of the log in all (method notes, section 6.2)."""
 
@@ -72,7 +79,13 @@ class Config:
     num_robots: int = 300
     """Individuals of a generation (Table S3)."""
     trajectory_length: int = 500
-    """Control steps (Table S3)."""
+    """Control steps of an individual (Table S3); of ``replay`` all windows together."""
+    collection: Literal["policy", "replay"] = "policy"
+    """``policy``: individuals roll out the policy (Algorithm S2); ``replay``: windows of the log (ours)."""
+    window: int | None = None
+    """Control steps of a replayed window; when not given, 1 for an exact log and 5 for a noisy one."""
+    skip: int | None = None
+    """First steps of a window that do not count; when not given, 0 for an exact log and 1 for a noisy one."""
     noise: float = 0.0
     """Measurement noise that the robot is known to have, as in ``record_log.py``."""
     latency: int = 0
@@ -92,7 +105,22 @@ class Config:
 
 
 PAPER = Config(search=SearchConfig(scale="linear", bounded=True))
-CPU = Config(trajectory_length=200, critic=CriticConfig(difference=True))
+CPU = Config(
+    generations=25,
+    num_robots=150,
+    trajectory_length=100,
+    collection="replay",
+    search=SearchConfig(covariance="full", centre="old"),
+    critic=CriticConfig(
+        optimizer="adam",
+        learning_rate=1e-3,
+        weight_clip=None,
+        gradient_penalty=1.0,
+        matched=True,
+        clip=3.0,
+        batch_per_robot=8,
+    ),
+)
 SMOKE = replace(
     CPU,
     name="smoke",
@@ -103,3 +131,15 @@ SMOKE = replace(
     critic=replace(CPU.critic, updates=2, hidden=(16, 16)),
 )
 PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}
+
+REPLAY_WINDOWS = {"exact": (1, 0), "noisy": (5, 1)}
+"""Steps and skipped steps of a replayed window. With exact start states the first step says most, and later ones only
+add what the estimated trunk velocity gets wrong; a start state that was smoothed out of noise needs some steps to be
+forgotten (measured: docs/easi.md)."""
+
+
+def replay_window(cfg: Config) -> tuple[int, int]:
+    """Steps and skipped steps of a window, given ones before usual ones."""
+    steps, skip = REPLAY_WINDOWS["noisy" if cfg.noise else "exact"]
+    steps = steps if cfg.window is None else cfg.window
+    return steps, min(skip, steps - 1) if cfg.skip is None else cfg.skip

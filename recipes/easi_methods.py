@@ -1,6 +1,6 @@
 """Identification methods that EASI is compared with, on one log and with one budget of simulated control steps.
 
-* ``cma_es``: CMA-ES (``cmaes``) on the open-loop prediction error of ``easi_windows.py``.
+* ``cma_es``: CMA-ES (``cmaes``) on the open-loop prediction error of ``collectors/windows.py``.
 * ``sysid``: Gauss-Newton of MuJoCo's own toolbox (``mujoco.sysid``) on the same residuals.
 * ``uniform``: no identification; the first range as it is, as in uniform domain randomisation.
 * ``easi``: the search of ``easi.py``.
@@ -26,13 +26,13 @@ import numpy as np
 import torch
 from cmaes import CMA
 from easi_report import physical
-from easi_windows import Windows, measurement, predict
 from mujoco import sysid
 from torch import Tensor
 
-from agility_rl.collectors import ParameterSpace
+from agility_rl.collectors import ParameterSpace, Windows
 from agility_rl.collectors.parameters import Parameter
 from agility_rl.collectors.rollout import START_ENTRIES
+from agility_rl.collectors.windows import measurement, predict
 from agility_rl.go2 import constants
 from agility_rl.go2.model import build_spec
 from agility_rl.simulation import make_simulator
@@ -98,7 +98,7 @@ def run_easi(problem: Problem) -> tuple[Tensor, Tensor, int]:
         easi.evolve(parts, cfg)
     parts.simulator.close()
     centre, spread = physical(parts.search, parts.space)
-    return centre, spread, cfg.generations * cfg.num_robots * cfg.trajectory_length
+    return centre, spread, cfg.generations * cfg.num_robots * parts.collector.num_steps
 
 
 def run_cma_es(problem: Problem) -> tuple[Tensor, Tensor, int]:

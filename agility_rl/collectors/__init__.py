@@ -8,9 +8,11 @@ from agility_rl.collectors.evolution import EvolutionStrategy
 from agility_rl.collectors.log_formats import RobotLogError
 from agility_rl.collectors.log_recording import RobotLogRecorder, record_robot_log
 from agility_rl.collectors.parameters import GAINS, Parameter, ParameterSpace
+from agility_rl.collectors.replay import ReplayCollector
 from agility_rl.collectors.robot_log import RobotLog
 from agility_rl.collectors.rollout import fallen, roll_out, standing_states
 from agility_rl.collectors.sensors import RobotSensors
+from agility_rl.collectors.windows import Windows, cut_windows
 
 __all__ = [
     "GAINS",
@@ -19,10 +21,13 @@ __all__ = [
     "EvolutionStrategy",
     "Parameter",
     "ParameterSpace",
+    "ReplayCollector",
     "RobotLog",
     "RobotLogError",
     "RobotLogRecorder",
     "RobotSensors",
+    "Windows",
+    "cut_windows",
     "fallen",
     "one_thread",
     "record_robot_log",

@@ -47,7 +47,7 @@ def yaw_rate(state: LocomotionState) -> Tensor:
 
 
 def velocity_progress(state: LocomotionState) -> Tensor:
-    """``max(1 - |v - v*| / max(v*, 0.1 m/s), -1)`` with the mean speed v in the commanded direction and the commanded v*.
+    """``max(1 - |v - v*| / max(v*, 0.1 m/s), -1)``, v the mean speed in the commanded direction, v* the commanded one.
 
     Ours: it pays nothing for standing and has a slope there, where the exponential of :func:`linear_velocity` has
     almost none, and it is as steep for a slow walk as for a canter. What goes sideways is the exponential's part.

@@ -18,25 +18,33 @@ from agility_rl.modules.normalization import FeatureNormalizer
 NORMALIZED_TRANSITION = "normalized_transition"
 """float32 ``[*B, 2 S + A]``, what the network sees: the gradient penalty differentiates with respect to this."""
 
+TINY_DISCREPANCY = 1e-6
+"""Least scale of a discrepancy [SI units]: differences below are rounding."""
+
 
 class TransitionDiscriminator(TensorDictModuleBase):
     r"""Judge transitions: :math:`\tilde D(s, a, s')`, high for the robot, low for the simulator.
 
     The simulator's physics shows in how a state follows from the last, which policy and terrain hide the less, the more
     the network sees of it: with ``difference`` the third input is s' - s, scaled by its own, much smaller, spread. The
-    two forms carry the same information; at 50 Hz s' alone is nearly s.
+    two forms carry the same information; at 50 Hz s' alone is nearly s. Where it is known what the robot did after the
+    same state and action (:class:`agility_rl.collectors.ReplayCollector`), that is the best origin: with
+    ``matched_key`` the third input is the discrepancy s' - s'_R, 0 for the robot, and :meth:`rescale` keeps it in view
+    while the simulator comes closer.
 
     .. math:: \tilde D(s, a, s') = \mathrm{MLP}(\mathrm{norm}([s, a, s'])) \quad\text{or}\quad
-              \mathrm{MLP}(\mathrm{norm}([s, a, s' - s]))
+              \mathrm{MLP}(\mathrm{norm}([s, a, s' - s])) \quad\text{or}\quad
+              \mathrm{MLP}(\mathrm{norm}([s, a, s' - s'_R]))
 
     Source: Algorithm S2, D-tilde of Eq. (13); sizes 128-128 with ReLU: EASI's release (method notes, section 6.2).
     Differs from it: inputs are normalised by fixed statistics of the log, because radians and rad/s differ by a factor
-    of fifty and clipped weights cannot make up for it.
+    of fifty and clipped weights cannot make up for it. Both other third inputs are ours.
 
     Keys read:
         measurement          float32 ``[*B, S]``  state, as measured [SI units]
         action               float32 ``[*B, A]``  action taken in it [action units]
         (next, measurement)  float32 ``[*B, S]``  state one control step later
+        matched_key          float32 ``[*B, S]``  that of the robot; only if a key is given
     Keys written:
         transition_logit       float32 ``[*B, 1]``        D(s, a, s'), unbounded [1]
         normalized_transition  float32 ``[*B, 2 S + A]``  what the network sees [1]
@@ -47,13 +55,16 @@ class TransitionDiscriminator(TensorDictModuleBase):
         hidden: sizes of the hidden layers.
         normalizer: scales the ``2 S + A`` inputs; ``None`` takes them as they are.
         difference: give the network s' - s instead of s'; the normaliser's statistics are then of s' - s as well.
+        matched_key: key of what the robot measured after the same state and action; the third input is then s' minus
+            that.
         measurement_key: key of the state; the following state stands under ``("next", measurement_key)``.
         action_key: key of the action.
         out_key: key of the logit.
         normalized_key: key of the normalised inputs.
 
     Raises:
-        ValueError: if the normaliser has statistics of another size, or an input has another size (at the call).
+        ValueError: if the normaliser has statistics of another size, s' is to be relative to two states, or an input
+            has another size (at the call).
 
     Example:
         >>> from tensordict import TensorDict
@@ -75,6 +86,7 @@ class TransitionDiscriminator(TensorDictModuleBase):
         *,
         normalizer: FeatureNormalizer | None = None,
         difference: bool = False,
+        matched_key: NestedKey | None = None,
         measurement_key: NestedKey = MEASUREMENT,
         action_key: NestedKey = ACTION,
         out_key: NestedKey = TRANSITION_LOGIT,
@@ -87,13 +99,16 @@ class TransitionDiscriminator(TensorDictModuleBase):
                 f"the normaliser has statistics of {normalizer.mean.shape[0]} numbers, but a transition has "
                 f"2 * {num_measurements} + {num_actions} = {size}"
             )
-        self.sizes = (num_measurements, num_actions, num_measurements)
+        if difference and matched_key is not None:
+            raise ValueError("give difference or matched_key: s' is relative to one state, not to two")
+        matched = [] if matched_key is None else [matched_key]
+        self.sizes = (num_measurements, num_actions, num_measurements, *(num_measurements for _ in matched))
         self.difference = difference
         self.normalizer = normalizer
         self.layers = mlp(size, hidden, activation=nn.ReLU)
         self.head = nn.Linear(hidden[-1], 1)
         nn.init.zeros_(self.head.bias)
-        self.in_keys = [measurement_key, action_key, _following(measurement_key)]
+        self.in_keys = [measurement_key, action_key, _following(measurement_key), *matched]
         self.out_keys = [out_key, normalized_key]
 
     @classmethod
@@ -124,8 +139,35 @@ class TransitionDiscriminator(TensorDictModuleBase):
         for key, value, size in zip(self.in_keys, inputs, self.sizes):
             if value.shape[-1] != size:
                 raise ValueError(f"{key!r} must be [*B, {size}], got {list(value.shape)}")
-        state, action, following = inputs
-        return torch.cat((state, action, following - state if self.difference else following), -1)
+        state, action, following, *matched = inputs
+        origin = matched[0] if matched else state if self.difference else None
+        return torch.cat((state, action, following if origin is None else following - origin), -1)
+
+    @torch.no_grad()
+    def rescale(self, transitions: TensorDictBase) -> None:
+        """Scale the discrepancy from the robot by its median size in given transitions, in place.
+
+        The median, because start states of replayed windows are far off now and then; what is that far off ends at the
+        normaliser's clip and no longer counts.
+
+        Args:
+            transitions: the simulator's, ``[*B]``; with ``(collector, mask)`` only the marked ones count.
+
+        Raises:
+            ValueError: if the network sees no discrepancy, has no normaliser, or no transition counts.
+        """
+        size = self.sizes[2]
+        if len(self.sizes) < 4 or self.normalizer is None:
+            raise ValueError(
+                "rescale needs a matched_key and a normaliser; build with from_transitions(matched_key=...)"
+            )
+        discrepancy = self.assemble(transitions)[..., -size:]
+        mask = transitions.get(("collector", "mask"), None)
+        discrepancy = discrepancy.flatten(0, -2) if mask is None else discrepancy[mask]
+        if not len(discrepancy):
+            raise ValueError("no transition is valid; look at the parameters and the start states")
+        scale = discrepancy.abs().median(0).values.clamp_min(TINY_DISCREPANCY)
+        self.normalizer.std[-size:] = scale.to(self.normalizer.std.dtype)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the logit and the normalised inputs."""

@@ -91,3 +91,49 @@ def test_errors() -> None:
         TransitionDiscriminator(S, A, normalizer=FeatureNormalizer(torch.zeros(7), torch.ones(7)))
     with pytest.raises(ValueError, match=r"'action' must be \[\*B, 2\], got \[5, 4\]"):
         TransitionDiscriminator(S, A)(transitions().set("action", torch.zeros(5, 4)))
+    with pytest.raises(ValueError, match="relative to one state"):
+        TransitionDiscriminator(S, A, difference=True, matched_key=MATCHED)
+    with pytest.raises(ValueError, match="rescale needs a matched_key"):
+        TransitionDiscriminator.from_transitions(transitions()).rescale(transitions())
+
+
+MATCHED = ("next", "matched_measurement")
+
+
+def matched(count: int, scale: Tensor) -> TensorDict:
+    td = transitions(count)
+    td[MATCHED] = td["next", "measurement"] - scale * torch.randn(count, S)
+    return td
+
+
+def test_the_discrepancy_from_the_robot_against_numpy() -> None:
+    network = TransitionDiscriminator(S, A, (7, 6), matched_key=MATCHED)
+    td = matched(5, torch.ones(S))
+    state, action, after, robot = (
+        td[key].double().numpy() for key in ("measurement", "action", ("next", "measurement"), MATCHED)
+    )
+    expected = by_hand(network, np.concatenate((state, action, after - robot), -1))
+    np.testing.assert_allclose(network(td)["transition_logit"].detach().numpy(), expected, rtol=1e-4, atol=1e-6)
+    assert network.in_keys[-1] == MATCHED
+
+
+def test_the_discrepancy_is_scaled_by_its_median_and_clipped() -> None:
+    real = transitions(50)
+    real[MATCHED] = real["next", "measurement"]
+    network = TransitionDiscriminator.from_transitions(real, clip=3.0, matched_key=MATCHED)
+    scale = torch.tensor([1e-3, 1.0, 50.0])
+    td = matched(400, scale)
+    td["next", "measurement"][0] += 1e6  # a window whose start state was far off
+    td["collector"] = TensorDict({"mask": torch.arange(400) < 200}, [400])
+    td[MATCHED][200:] += 1e6
+    before = network.normalizer.std[: S + A].clone()
+    network.rescale(td)
+    discrepancy = (td["next", "measurement"] - td[MATCHED])[:200].abs().numpy()
+    middle = np.sort(discrepancy, 0)[99]
+    np.testing.assert_allclose(network.normalizer.std[-S:].numpy(), middle, rtol=1e-5)
+    assert torch.equal(network.normalizer.std[: S + A], before)
+    seen = network(td)["normalized_transition"][..., -S:]
+    assert float(seen[0].min()) == 3.0 and float(network(real)["normalized_transition"][..., -S:].abs().max()) == 0.0
+    td["collector", "mask"] = torch.zeros(400, dtype=torch.bool)
+    with pytest.raises(ValueError, match="no transition is valid"):
+        network.rescale(td)

@@ -75,9 +75,14 @@ def test_a_smoke_run_writes_everything(
     assert "the log was recorded with noise None, the search has 0.0" in output
 
 
-def test_a_resumed_search_equals_an_uninterrupted_one_bit_for_bit(easi: ModuleType, log: Path, tmp_path: Path) -> None:
-    whole = easi.train(smoke(easi, log, tmp_path, "whole", noise=0.5))
-    halves = easi.train(smoke(easi, log, tmp_path, "halves", noise=0.5, generations=1))
+@pytest.mark.parametrize("collection", ["replay", "policy"])
+def test_a_resumed_search_equals_an_uninterrupted_one_bit_for_bit(
+    easi: ModuleType, log: Path, tmp_path: Path, collection: str
+) -> None:
+    critic = replace(easi.PRESETS["smoke"].critic, matched=collection == "replay")
+    options = {"noise": 0.5, "collection": collection, "critic": critic}
+    whole = easi.train(smoke(easi, log, tmp_path, "whole", **options))
+    halves = easi.train(smoke(easi, log, tmp_path, "halves", generations=1, **options))
     # What a resume was started with does not matter but for how long and how fast.
     easi.train(replace(easi.PRESETS["paper"], resume=halves, generations=3, num_threads=2))
     assert (whole / "result.json").read_text() == (halves / "result.json").read_text()
@@ -132,6 +137,23 @@ def test_the_paper_preset_is_table_s3(easi: ModuleType) -> None:
     assert (paper.num_robots, paper.trajectory_length) == (300, 500)
     assert (paper.critic.updates, paper.critic.learning_rate, paper.search.survival_rate) == (10, 3e-4, 0.5)
     assert paper.search.parameters == GAINS
+    assert paper.collection == "policy" and not paper.critic.matched, "individuals roll out the policy"
+    critic = (paper.critic.optimizer, paper.critic.weight_clip, paper.critic.gradient_penalty, paper.critic.hidden)
+    assert critic == ("rmsprop", 0.01, None, (128, 128))
+
+
+def test_a_noisy_log_is_replayed_in_longer_windows(easi: ModuleType, log: Path, tmp_path: Path) -> None:
+    cpu = easi.PRESETS["cpu"]
+    known = [
+        easi.replay_window(replace(cpu, **options))
+        for options in ({}, {"noise": 1.0, "latency": 1}, {"latency": 1}, {"window": 8}, {"noise": 1.0, "window": 1})
+    ]
+    assert known == [(1, 0), (5, 1), (1, 0), (8, 0), (1, 0)]
+    for noise, count, length in ((0.0, 20, 1), (1.0, 4, 4)):
+        parts = easi.build(smoke(easi, log, tmp_path, noise=noise))
+        assert parts.collector.num_steps == 20
+        assert parts.collector.collect(parts.search.ask()).shape == (8, count * length)
+        parts.simulator.close()
 
 
 @pytest.mark.parametrize(
@@ -146,7 +168,11 @@ def test_the_paper_preset_is_table_s3(easi: ModuleType) -> None:
         (("--log", "{log}", "--truth", "{log}"), "no truth of record_log.py"),
         (("--log", "{log}", "--truth", "{truth}", "--search.parameters", "armature"), "does not know armature"),
         (("--log", "{log}", "--policy", "nowhere"), "nowhere"),
-        (("--log", "{log}", "--critic.weight-clip", "None"), "bound on its slope"),
+        (("--log", "{log}", "--critic.gradient-penalty", "None"), "bound on its slope"),
+        (("--log", "{log}", "--collection", "policy"), "--critic.matched needs --collection replay"),
+        (("--log", "{log}", "--window", "21"), "expected --window from 1 to --trajectory-length 20, got 21"),
+        (("--log", "{log}", "--window", "3", "--skip", "3"), "0 <= skip < window, got 3 and 3"),
+        (("--log", "{log}", "--critic.difference"), "relative to one state"),
         (("--log", "{log}", "--num-robots", "2"), "survivors"),
         (("--resume", "nowhere"), "nothing to resume"),
     ],
@@ -232,6 +258,7 @@ def test_a_log_of_the_recorder_is_found_again(module: Module, tmp_path: Path) ->
     parts = easi.build(smoke(easi, file, tmp_path, truth=truth))
     parts.simulator.close()
     recording = json.loads(truth.read_text())["recording"]
+    del recording["model"]  # contacts, which a search cannot change
     assert {name: parts.inputs[name] for name in recording} == recording
     assert parts.truth is not None and parts.truth.tolist() == ParameterSpace().nominal.tolist()
     assert len(parts.real) == int((~RobotLog.load(file).start[1:]).sum())

@@ -1,4 +1,4 @@
-"""EASI's baselines on logs of some seconds: windows, methods, and the command that compares them."""
+"""EASI's baselines on logs of some seconds: methods, and the command that compares them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ import pytest
 import torch
 from mujoco import sysid
 
-from agility_rl.collectors import GAINS, ParameterSpace, RobotLog, record_robot_log
-from agility_rl.go2 import constants, kinematics
+from agility_rl.collectors import GAINS, ParameterSpace, RobotLog, cut_windows, record_robot_log
+from agility_rl.collectors.windows import predict
+from agility_rl.go2 import constants
 from agility_rl.go2.model import build_spec
 from agility_rl.simulation import make_simulator
 
@@ -44,7 +45,7 @@ def problem(module: Module, log: RobotLog, **changes: Any) -> Any:
     easi = replace(module("easi_config").SMOKE, num_robots=32, num_threads=1)
     own = {
         "space": SPACE,
-        "windows": module("easi_windows").cut_windows(log, 5, skip=1),
+        "windows": cut_windows(log, 5, skip=1),
         "easi": easi,
         "friction_loss": constants.FRICTION_LOSS,
         "budget": 15_000,
@@ -52,69 +53,6 @@ def problem(module: Module, log: RobotLog, **changes: Any) -> Any:
         "seed": 0,
     }
     return module("easi_methods").Problem(**(own | changes))
-
-
-# -- windows -----------------------------------------------------------------------------------------------------------
-def numbered(rows: int, starts: tuple[int, ...]) -> RobotLog:
-    """A log whose angular velocity and action say which row they stand in."""
-    number = torch.arange(rows, dtype=torch.float32)
-    return RobotLog(
-        time=constants.CONTROL_DT * torch.arange(rows, dtype=torch.float64),
-        joint_position=torch.tensor(constants.DEFAULT_POSE).repeat(rows, 1),
-        joint_velocity=torch.zeros(rows, 12),
-        roll_pitch=torch.zeros(rows, 2),
-        angular_velocity=number[:, None].repeat(1, 3),
-        action=number[:, None].repeat(1, 12),
-        start=torch.isin(torch.arange(rows), torch.tensor(starts)),
-    )
-
-
-@pytest.mark.parametrize("latency", [0, 2])
-def test_windows_cross_no_reset_and_undo_the_latency(module: Module, latency: int) -> None:
-    windows = module("easi_windows").cut_windows(numbered(100, (0, 48)), 8, latency=latency)
-    first = windows.start["root_angular_velocity"][:, 0]
-    pose, scale = constants.DEFAULT_POSE[1], constants.ACTION_SCALE[1]
-    action = (windows.target[..., 1] - pose) / scale
-    # What was measured ``latency`` rows later is the state in which this row's action was taken.
-    torch.testing.assert_close(action[:, 0], first - latency, atol=1e-3, rtol=0.0)
-    torch.testing.assert_close(windows.measured[..., 2], first[:, None] + 1 + torch.arange(8.0))
-    rows = first - latency
-    assert rows.tolist() == [0, 8, 16, 24, 32, 48, 56, 64, 72, 80, 88]
-    assert not bool(((rows < 48) & (rows + latency + 8 >= 48)).any())
-
-
-def test_standing_feet_tell_the_velocity_of_the_trunk(module: Module) -> None:
-    """Feet that stay in place while the trunk moves with v go with -v in its frame: inverse kinematics say how."""
-    velocity = torch.tensor([0.4, -0.1, 0.05], dtype=torch.float64)
-    pose = torch.tensor(constants.DEFAULT_POSE, dtype=torch.float64)
-    feet, dt = kinematics.forward(pose), 1e-5
-    speed = (kinematics.inverse(feet - dt * velocity) - kinematics.inverse(feet + dt * velocity)) / (2 * dt)
-    measured = torch.cat((torch.zeros(5), pose.float(), speed.float()))[None]
-    state = module("easi_windows").estimate_states(measured)
-    torch.testing.assert_close(state["root_linear_velocity"][0], velocity.float(), atol=1e-3, rtol=0.0)
-    height = constants.FOOT_RADIUS - float(feet[:, 2].min()) - module("easi_windows").SINK
-    assert state["root_position"][0].tolist() == pytest.approx([0.0, 0.0, height], abs=1e-5)
-
-
-def test_a_prediction_from_the_true_state_with_the_true_gains_is_exact(module: Module, log: RobotLog) -> None:
-    windows = module("easi_windows").cut_windows(log, 4)
-    few = windows.take(torch.arange(3))
-    simulator = make_simulator(num_simulations=4, num_threads=1)
-    individuals = torch.stack((torch.full((6,), 0.5).double(), TRUTH))
-    predict = module("easi_windows").predict
-    once = predict(simulator, SPACE, individuals, few)  # two chunks of robots, the second half idle
-    exact = replace(few, measured=once[1])
-    assert float(exact.residual(predict(simulator, SPACE, TRUTH[None], exact)).abs().max()) == 0.0
-    assert float(exact.residual(once[0]).abs().mean()) > 0.1
-    simulator.close()
-
-
-def test_noise_is_smoothed_in_start_states_only(module: Module) -> None:
-    time = constants.CONTROL_DT * torch.arange(100)
-    state = torch.sin(6.0 * time)[:, None].repeat(1, 29)
-    smooth = module("easi_windows").smooth(state)
-    torch.testing.assert_close(smooth[5:-5, 5], state[5:-5, 5], atol=1e-3, rtol=0.0)
-    torch.testing.assert_close(smooth[5:-5, 17], 6.0 * torch.cos(6.0 * time)[5:-5], atol=0.05, rtol=0.0)
 
 
 # -- methods -----------------------------------------------------------------------------------------------------------
@@ -136,9 +74,22 @@ def test_a_baseline_comes_nearer_to_the_truth(
     assert bool((found.spread < centre.spread).all()), "the log tells something of every gain"
 
 
+def test_the_replaying_search_finds_gains_outside_its_first_range(
+    module: Module, log: RobotLog, tmp_path: Path
+) -> None:
+    """The preset ``cpu`` cut to 9,600 control steps; with a span of 1.5, five of the six gains lie outside."""
+    cpu = module("easi_config").CPU
+    cpu = replace(cpu, log=log.save(tmp_path / "log.npz"), num_robots=40, trajectory_length=20, generations=12)
+    posed = problem(module, log, easi=replace(cpu, num_threads=1, search=replace(cpu.search, span=1.5)))
+    identify = module("easi_methods").identify
+    found = identify("easi", posed)
+    assert found.steps == 9_600
+    assert error(found.centre) < 0.25 < 0.4 < error(identify("uniform", posed).centre)
+
+
 def test_the_toolbox_predicts_what_the_batch_simulator_predicts(module: Module, log: RobotLog) -> None:
     """Two ways to simulate: models compiled one by one and ``mujoco.rollout``, or one batch with expanded fields."""
-    methods, windows = module("easi_methods"), module("easi_windows").cut_windows(log, 5, skip=1)
+    methods, windows = module("easi_methods"), cut_windows(log, 5, skip=1)
     windows = windows.take(torch.arange(4))
     points = torch.stack((torch.full((6,), 0.5).double(), TRUTH))
     spec = build_spec()
@@ -153,7 +104,7 @@ def test_the_toolbox_predicts_what_the_batch_simulator_predicts(module: Module, 
         resample_true=False,
     )
     simulator = make_simulator(num_simulations=8, num_threads=1)
-    expected = windows.residual(module("easi_windows").predict(simulator, SPACE, points, windows))
+    expected = windows.residual(predict(simulator, SPACE, points, windows))
     simulator.close()
     assert values.shape == (4 * 29, 8)
     got = torch.from_numpy(np.ascontiguousarray(values.T)).reshape(expected.shape)
@@ -289,11 +240,3 @@ def test_bad_options_give_one_clear_line(
     errors = capsys.readouterr().err
     assert message in errors and errors.count("\n") == 1
     assert not (tmp_path / "runs").exists()
-
-
-def test_windows_that_do_not_fit_say_so(module: Module, log: RobotLog) -> None:
-    cut = module("easi_windows").cut_windows
-    with pytest.raises(ValueError, match="0 <= --skip < --window, got 5 and 5"):
-        cut(log, 5, skip=5)
-    with pytest.raises(ValueError, match="expected 201 rows without a reset"):
-        cut(log, 200)

@@ -1,17 +1,16 @@
-"""Open-loop prediction of a robot log: what the baselines of EASI minimise.
+"""Short windows of a robot log, which a simulator can replay: from the log's own states, with the log's own actions.
 
-A log is cut into short windows. Each starts from the state that the log shows, plays the logged actions, and is
-compared with what was measured after every control step. A log holds neither trunk velocity nor trunk height, so both
-are estimated from the legs: feet that bear the trunk stand still on the ground. Such a start state is not exact, and
-what it costs fades within some steps, as soft contacts and joint controllers forget where they came from; the first
-steps of a window therefore need not count.
-
-Source: no paper; the usual prediction error of system identification, on a robot whose base floats.
+Each window starts from the state that the log shows, plays the logged actions, and is compared with what was measured
+after every control step. A log holds neither trunk velocity nor trunk height, so both are estimated from the legs: feet
+that bear the trunk stand still on the ground. Such a start state is not exact. Around impacts it is far off, so that
+the errors have heavy tails and a sum of squares is a poor measure of them; elsewhere what it costs fades within some
+steps, as soft contacts and joint controllers forget where they came from, and the first steps of a window therefore
+need not count.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
@@ -20,7 +19,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from agility_rl import rotations
-from agility_rl.collectors import ParameterSpace, RobotLog, one_thread
+from agility_rl.collectors.easi import one_thread
+from agility_rl.collectors.parameters import ParameterSpace
+from agility_rl.collectors.robot_log import RobotLog
 from agility_rl.collectors.rollout import START_ENTRIES
 from agility_rl.go2 import constants, features, kinematics
 from agility_rl.simulation import Simulator
@@ -42,29 +43,52 @@ LARGEST_RESIDUAL = 10.0
 
 @dataclass(frozen=True)
 class Windows:
-    """Pieces of a log to predict.
+    """Pieces of a robot log to predict.
+
+    Source: no paper; the usual prediction error of system identification, on a robot whose base floats.
 
     Attributes:
         start: ``[W]``, estimated states, as ``Simulator.reset`` takes them.
-        target: ``[W, H, 12]``, joint targets [rad], held for one control step each.
+        first: ``[W, 29]``, what the robot measured there.
+        action: ``[W, H, 12]``, what it did [action units].
         measured: ``[W, H, 29]``, what the robot measured after each, latency taken out.
         scale: ``[29]``, expected error of a perfect model.
         skip: predictions of this many first steps do not count.
+
+    Example:
+        >>> time = constants.CONTROL_DT * torch.arange(100, dtype=torch.float64)
+        >>> log = RobotLog(
+        ...     time=time, joint_position=torch.tensor(constants.DEFAULT_POSE).repeat(100, 1),
+        ...     joint_velocity=torch.zeros(100, 12), roll_pitch=torch.zeros(100, 2),
+        ...     angular_velocity=torch.zeros(100, 3), action=torch.sin(time)[:, None].repeat(1, 12).float(),
+        ...     start=torch.zeros(100, dtype=torch.bool),
+        ... )
+        >>> windows = cut_windows(log, 5, skip=1)
+        >>> len(windows), windows.target.shape
+        (19, torch.Size([19, 5, 12]))
+        >>> windows.residual(windows.measured).shape
+        torch.Size([19, 4, 29])
     """
 
     start: TensorDict
-    target: Tensor
+    first: Tensor
+    action: Tensor
     measured: Tensor
     scale: Tensor
     skip: int
 
     def __len__(self) -> int:
-        return len(self.target)
+        return len(self.action)
 
     @property
     def steps(self) -> int:
         """Control steps of a window, H."""
-        return self.target.shape[1]
+        return self.action.shape[1]
+
+    @property
+    def target(self) -> Tensor:
+        """Joint targets ``[W, H, 12]`` [rad], held for one control step each."""
+        return torch.tensor(constants.DEFAULT_POSE) + torch.tensor(constants.ACTION_SCALE) * self.action
 
     def residual(self, predicted: Tensor, measured: Tensor | None = None) -> Tensor:
         """(Predicted - measured) / scale, clipped, ``[*B, H - skip, 29]``; the largest where a simulation diverged."""
@@ -74,7 +98,9 @@ class Windows:
 
     def take(self, rows: Tensor) -> Windows:
         """Some of the windows."""
-        return Windows(self.start[rows], self.target[rows], self.measured[rows], self.scale, self.skip)
+        return replace(
+            self, start=self.start[rows], first=self.first[rows], action=self.action[rows], measured=self.measured[rows]
+        )
 
 
 @one_thread()
@@ -92,19 +118,19 @@ def cut_windows(log: RobotLog, steps: int, *, skip: int = 0, noise: float = 0.0,
         ValueError: if the lengths do not fit, or no window fits into the log.
     """
     if not 0 <= skip < steps:
-        raise ValueError(f"expected 0 <= --skip < --window, got {skip} and {steps} control steps")
-    pose, scale = torch.tensor(constants.DEFAULT_POSE), torch.tensor(constants.ACTION_SCALE)
+        raise ValueError(f"expected 0 <= skip < window, got {skip} and {steps} control steps")
     measured = features.measurement(log.roll_pitch, log.angular_velocity, log.joint_position, log.joint_velocity)
     bounds = sorted({0, *log.start.nonzero()[:, 0].tolist(), len(log)})
-    starts, targets, followings = [], [], []
+    starts, firsts, actions, followings = [], [], [], []
     for first, last in pairwise(bounds):
-        state, target = measured[first + latency : last], pose + scale * log.action[first:last]
+        state, action = measured[first + latency : last], log.action[first:last]
         if len(state) < max(steps + 1, SMOOTHING[0]):
             continue
         start = smooth(state) if noise else state
         for row in range(0, len(state) - steps, steps):
             starts.append(start[row])
-            targets.append(target[row : row + steps])
+            firsts.append(state[row])
+            actions.append(action[row : row + steps])
             followings.append(state[row + 1 : row + steps + 1])
     if not starts:
         raise ValueError(f"{log.name}: expected {steps + latency + 1} rows without a reset, found no such piece")
@@ -112,7 +138,8 @@ def cut_windows(log: RobotLog, steps: int, *, skip: int = 0, noise: float = 0.0,
     deviation = noise * features.noise_scale(LAYOUT) / 3.0**0.5  # of uniform noise
     return Windows(
         estimate_states(torch.stack(starts)),
-        torch.stack(targets),
+        torch.stack(firsts),
+        torch.stack(actions),
         torch.stack(followings),
         (missed.square() + deviation.square()).sqrt().clamp_min(1e-6),
         skip,
@@ -178,21 +205,25 @@ def predict(simulator: Simulator, space: ParameterSpace, individuals: Tensor, wi
         ``[P, W, H, 29]``, the measurements predicted, NaN where the simulation diverged.
     """
     robots, values = simulator.num_simulations, space.denormalize(individuals)
-    everyone = torch.ones(robots, dtype=torch.bool)
-    pairs = torch.cartesian_prod(torch.arange(len(individuals)), torch.arange(len(windows)))
-    predicted = []
+    everyone, target = torch.ones(robots, dtype=torch.bool), windows.target
+    # Everyone plays a window before the next begins: where robots are a multiple of individuals, every chunk has the
+    # same parameters, and they are set once.
+    pairs = torch.cartesian_prod(torch.arange(len(windows)), torch.arange(len(individuals)))
+    predicted, present_ones = [], None
     for chunk in pairs.split(robots):
         # Robots left over by an incomplete chunk repeat its first pair; nobody looks at them.
-        individual, window = torch.cat((chunk, chunk[:1].expand(robots - len(chunk), 2))).unbind(-1)
-        simulator.set_parameters(everyone, **space.fields(values[individual]))
+        window, individual = torch.cat((chunk, chunk[:1].expand(robots - len(chunk), 2))).unbind(-1)
+        if present_ones is None or not torch.equal(individual, present_ones):
+            simulator.set_parameters(everyone, **space.fields(values[individual]))
+            present_ones = individual
         simulator.reset(everyone, **{name: windows.start[name][window] for name in START_ENTRIES})
         steps, diverged = [], torch.zeros(robots, dtype=torch.bool)
-        for target in windows.target[window].unbind(1):
-            simulator.step(target)
+        for held in target[window].unbind(1):
+            simulator.step(held)
             diverged = diverged | simulator.unstable
             steps.append(torch.where(diverged[:, None], torch.nan, present(simulator)))
         predicted.append(torch.stack(steps, 1)[: len(chunk)])
-    return torch.cat(predicted).unflatten(0, (len(individuals), len(windows)))
+    return torch.cat(predicted).unflatten(0, (len(windows), len(individuals))).transpose(0, 1)
 
 
 def present(simulator: Simulator) -> Tensor:
