@@ -1,4 +1,4 @@
-"""EASI against CMA-ES, ``mujoco.sysid`` and uniform domain randomisation: same logs, same budget of simulated steps.
+"""EASI against CMA-ES, ``mujoco.sysid`` and uniform domain randomisation: same logs, windows and simulated steps.
 
 Every target is a simulator with six gains drawn log-uniformly from [1/3, 3] x nominal; its log is recorded, every
 method searches it, and the table compares their errors with the truth. Conditions:
@@ -76,10 +76,10 @@ class Config:
     methods: tuple[str, ...] = tuple(METHODS)
     steps: int = 4000
     """Rows of a log: 80 s (supplement S2)."""
-    window: int = 10
-    """Control steps that the baselines predict from one start state."""
-    skip: int = 3
-    """Predictions of this many first steps do not count, because they carry the error of the start state."""
+    window: int | None = None
+    """Control steps that the baselines predict from one start state; as EASI's when not given."""
+    skip: int | None = None
+    """First steps of a window that do not count for the baselines; as EASI's when not given."""
     population: int = 30
     """Individuals of CMA-ES; each predicts as many windows as the budget of EASI's generation allows."""
     resume: Path | None = None
@@ -152,11 +152,10 @@ def make_problem(cfg: Config, log: Path, index: int, condition: Condition) -> Pr
     easi = replace(cfg.easi, log=log, noise=condition.noise, latency=condition.latency, seed=seed, search=search)
     linear = {"scale": "linear"} if search.scale == "linear" else {}
     actor = make_actor(easi.policy, easi.behaviours, easi.command_seconds)
+    window, skip = easi_config.replay_window(replace(easi, window=cfg.window, skip=cfg.skip))
     return Problem(
         space=ParameterSpace([Parameter.named(name, span=search.span, **linear) for name in search.parameters]),
-        windows=cut_windows(
-            RobotLog.load(log), cfg.window, skip=cfg.skip, noise=condition.noise, latency=condition.latency
-        ),
+        windows=cut_windows(RobotLog.load(log), window, skip=skip, noise=condition.noise, latency=condition.latency),
         easi=easi,
         friction_loss=actor.friction_loss if easi.friction_loss is None else easi.friction_loss,
         budget=easi.generations * easi.num_robots * easi.trajectory_length,

@@ -1,6 +1,7 @@
 """Identification methods that EASI is compared with, on one log and with one budget of simulated control steps.
 
-* ``cma_es``: CMA-ES (``cmaes``) on the open-loop prediction error of ``collectors/windows.py``.
+* ``cma_es``: CMA-ES (``cmaes``) on the squared open-loop prediction error of ``collectors/windows.py``.
+* ``cma_es_robust``: the same search on EASI's units, a fixed distance in the place of EASI's critic.
 * ``sysid``: Gauss-Newton of MuJoCo's own toolbox (``mujoco.sysid``) on the same residuals.
 * ``uniform``: no identification; the first range as it is, as in uniform domain randomisation.
 * ``easi``: the search of ``easi.py``.
@@ -17,30 +18,26 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import easi
 import easi_config
-import mujoco
 import numpy as np
 import torch
 from cmaes import CMA
 from easi_report import physical
+from easi_toolbox import toolbox_comparison, toolbox_parameters, toolbox_trajectories
 from mujoco import sysid
 from torch import Tensor
 
 from agility_rl.collectors import ParameterSpace, Windows
-from agility_rl.collectors.parameters import Parameter
-from agility_rl.collectors.rollout import START_ENTRIES
-from agility_rl.collectors.windows import measurement, predict
-from agility_rl.go2 import constants
+from agility_rl.collectors.windows import predict
 from agility_rl.go2.model import build_spec
 from agility_rl.simulation import make_simulator
 
 UNIFORM_STD = 1.0 / math.sqrt(12.0)
 """Deviation of a uniform distribution on [0, 1], the first range in search coordinates."""
-FURTHEST = 30.0
-"""``mujoco.sysid`` needs finite bounds: this ratio to the nominal value, where a search without bounds has none."""
 DIFFERENCE = 1e-4
 """Step of the finite differences of ``mujoco.sysid`` in search coordinates; its default of 1.5e-8 falls below what the
 contact solver's tolerance leaves of a gradient."""
@@ -101,7 +98,18 @@ def run_easi(problem: Problem) -> tuple[Tensor, Tensor, int]:
     return centre, spread, cfg.generations * cfg.num_robots * parts.collector.num_steps
 
 
-def run_cma_es(problem: Problem) -> tuple[Tensor, Tensor, int]:
+def squares(windows: Windows, predicted: Tensor) -> Tensor:
+    """Squared misses in deviations, ``[N, W, H - skip, 29]``."""
+    return windows.residual(predicted).square()
+
+
+def clipped_medians(windows: Windows, predicted: Tensor) -> Tensor:
+    """Misses in their own medians, clipped where EASI's critic clips them, ``[N, W, H - skip, 29]``."""
+    miss = (predicted - windows.measured)[..., windows.skip :, :].abs().nan_to_num(math.inf)
+    return (miss / miss.flatten(0, -2).median(0).values.clamp_min(1e-9)).clamp(max=easi_config.CPU.critic.clip)
+
+
+def run_cma_es(problem: Problem, size_of: Callable[[Windows, Tensor], Tensor] = squares) -> tuple[Tensor, Tensor, int]:
     """CMA-ES; all individuals of a generation predict the same windows, drawn anew for every generation."""
     cfg, windows, space, population = problem.easi, problem.windows, problem.space, problem.population
     robots, size = cfg.num_robots, len(space)
@@ -123,7 +131,7 @@ def run_cma_es(problem: Problem) -> tuple[Tensor, Tensor, int]:
     while spent + cost <= problem.budget and not search.should_stop():
         individuals = torch.from_numpy(np.stack([search.ask() for _ in range(population)]))
         chosen = windows.take(torch.randperm(len(windows), generator=generator)[:count])
-        error = chosen.residual(predict(simulator, space, individuals, chosen)).square().flatten(1).mean(-1)
+        error = size_of(chosen, predict(simulator, space, individuals, chosen)).flatten(1).mean(-1)
         search.tell(list(zip(individuals.numpy(), error.tolist(), strict=True)))
         spent += cost
     simulator.close()
@@ -193,77 +201,6 @@ def run_sysid(problem: Problem) -> tuple[Tensor, Tensor, int]:
     return *_physical(space, torch.from_numpy(best), torch.from_numpy(deviation)), spent
 
 
-def toolbox_parameters(space: ParameterSpace, bounds: tuple[Tensor, Tensor]) -> sysid.ParameterDict:
-    """Search coordinates as parameters of the toolbox; it starts from the centre of the first range."""
-    nearest, furthest = (space.normalize(space.nominal * ratio) for ratio in (1.0 / FURTHEST, FURTHEST))
-    low, high = torch.maximum(nearest, bounds[0]), torch.minimum(furthest, bounds[1])
-
-    def setter(entry: Parameter) -> Callable[[Any, sysid.Parameter], None]:
-        alone = ParameterSpace([entry])
-        change = sysid.apply_pgain if entry.field == "stiffness" else sysid.apply_dgain
-
-        def write(spec: Any, parameter: sysid.Parameter) -> None:
-            value = alone.denormalize(torch.from_numpy(parameter.value)).item()
-            for joint in entry.entries:
-                change(spec, constants.ACTUATOR_NAMES[joint], value)
-
-        return write
-
-    found = sysid.ParameterDict()
-    for entry, least, most in zip(space.parameters, low.tolist(), high.tolist(), strict=True):
-        found[entry.name] = sysid.Parameter(entry.name, 0.5, least, most, modifier=setter(entry))
-    return found
-
-
-def toolbox_trajectories(model: mujoco.MjModel, windows: Windows) -> list[sysid.SystemTrajectory]:
-    """Every window as the toolbox takes it: a control for every physics step, a measurement for every control step."""
-    substeps = round(constants.CONTROL_DT / model.opt.timestep)
-    # The toolbox drops the last control, because it expects one for the last measurement too.
-    controls = windows.target.double().repeat_interleave(substeps, 1)
-    controls = torch.cat((controls, controls[:, -1:]), 1)
-    times = model.opt.timestep * np.arange(controls.shape[1])
-    ends = constants.CONTROL_DT * np.arange(1, windows.steps + 1)
-    names = {"measurement": (sysid.SignalType.CustomObs, np.arange(windows.measured.shape[-1]))}
-    start = {name: windows.start[name].double() for name in START_ENTRIES}
-    qpos = torch.cat([start[name] for name in ("root_position", "root_quaternion", "joint_position")], -1).numpy()
-    qvel = torch.cat(
-        [start[name] for name in ("root_linear_velocity", "root_angular_velocity", "joint_velocity")], -1
-    ).numpy()
-    return [
-        sysid.SystemTrajectory(
-            model=model,
-            control=sysid.TimeSeries(times, control),
-            sensordata=sysid.TimeSeries(ends, measured, names),
-            initial_state=sysid.create_initial_state(model, position, velocity),
-            state=None,
-        )
-        for control, measured, position, velocity in zip(
-            controls.numpy(), windows.measured.double().numpy(), qpos, qvel, strict=True
-        )
-    ]
-
-
-def toolbox_comparison(windows: Windows) -> Callable[..., Any]:
-    """The residual of one roll-out of the toolbox: that of CMA-ES, from states at the ends of control steps."""
-
-    def compare(
-        parameters: sysid.ParameterDict,
-        predicted: sysid.TimeSeries,
-        measured: sysid.TimeSeries,
-        model: mujoco.MjModel,
-        return_all: bool,
-        *,
-        state: np.ndarray,
-    ) -> tuple[np.ndarray, sysid.TimeSeries, sysid.TimeSeries]:
-        substeps = round(constants.CONTROL_DT / model.opt.timestep)
-        qpos, qvel = torch.from_numpy(state[substeps - 1 :: substeps, 1:].copy()).split((model.nq, model.nv), -1)
-        guess = measurement(qpos[:, 3:7], qvel[:, 3:6], qpos[:, 7:], qvel[:, 6:])
-        difference = windows.residual(guess, torch.from_numpy(measured.data))
-        return difference.numpy(), measured, measured
-
-    return compare
-
-
 def run_uniform(problem: Problem) -> tuple[Tensor, Tensor, int]:
     """Centre and spread of the first range; nothing is simulated."""
     size = len(problem.space)
@@ -280,6 +217,7 @@ def _physical(space: ParameterSpace, centre: Tensor, deviation: Tensor) -> tuple
 METHODS: dict[str, Callable[[Problem], tuple[Tensor, Tensor, int]]] = {
     "easi": run_easi,
     "cma_es": run_cma_es,
+    "cma_es_robust": partial(run_cma_es, size_of=clipped_medians),
     "sysid": run_sysid,
     "uniform": run_uniform,
 }

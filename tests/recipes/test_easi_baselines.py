@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -61,7 +62,9 @@ def error(centre: torch.Tensor) -> float:
     return float(((centre - truth).abs() / truth).mean())
 
 
-@pytest.mark.parametrize(("method", "budget", "share"), [("cma_es", 15_000, 0.35), ("sysid", 6_000, 0.15)])
+@pytest.mark.parametrize(
+    ("method", "budget", "share"), [("cma_es", 15_000, 0.35), ("cma_es_robust", 15_000, 0.35), ("sysid", 6_000, 0.15)]
+)
 def test_a_baseline_comes_nearer_to_the_truth(
     module: Module, log: RobotLog, method: str, budget: int, share: float
 ) -> None:
@@ -72,6 +75,32 @@ def test_a_baseline_comes_nearer_to_the_truth(
     assert error(found.centre) < share * error(centre.centre)
     assert 0 < found.steps <= posed.budget
     assert bool((found.spread < centre.spread).all()), "the log tells something of every gain"
+
+
+def test_robust_misses_are_in_medians_and_clipped(module: Module, log: RobotLog) -> None:
+    windows = cut_windows(log, 5, skip=1)
+    predicted = windows.measured[None].repeat(3, 1, 1, 1)
+    predicted[0] += 1.0
+    predicted[1] += 2.0
+    predicted[2, :, :, 0] = math.nan
+    predicted[2, :, :, 1:] += 9.0
+    size = module("easi_methods").clipped_medians(windows, predicted)
+    assert size.shape == (3, len(windows), 4, 29)
+    expected = torch.tensor([0.5, 1.0, 3.0])[:, None, None, None].expand_as(size)  # the median is 2, also with a NaN
+    torch.testing.assert_close(size, expected, atol=1e-3, rtol=1e-3)
+
+
+def test_the_baselines_see_the_windows_of_the_search(module: Module, log: RobotLog, tmp_path: Path) -> None:
+    baselines, path = module("easi_baselines"), log.save(tmp_path / "log.npz")
+    for name, noise, given, expected in (
+        ("clean", 0.0, {}, (1, 0)),
+        ("noisy", 1.0, {}, (5, 1)),
+        ("clean", 0.0, {"window": 10, "skip": 3}, (10, 3)),
+    ):
+        condition = replace(baselines.CONDITIONS[name], latency=0)
+        assert condition.noise == noise
+        posed = baselines.make_problem(replace(baselines.PRESETS["smoke"], **given), path, 0, condition)
+        assert (posed.windows.steps, posed.windows.skip) == expected
 
 
 def test_the_replaying_search_finds_gains_outside_its_first_range(
@@ -134,7 +163,7 @@ def test_one_command_compares_and_a_resume_runs_nothing_twice(
     folder = baselines.main(smoke(baselines, tmp_path))
     file = folder / "clean" / "target_00.json"
     first = json.loads(file.read_text())
-    assert list(first["methods"]) == ["easi", "cma_es", "sysid", "uniform"]
+    assert list(first["methods"]) == ["easi", "cma_es", "cma_es_robust", "sysid", "uniform"]
     steps = {name: entry["steps"] for name, entry in first["methods"].items()}
     # Eight robots, three generations of twenty steps, for everybody.
     assert first["budget"] == steps["easi"] == steps["cma_es"] == 480
@@ -160,7 +189,7 @@ def test_one_command_compares_and_a_resume_runs_nothing_twice(
 
     monkeypatch.setattr(baselines, "identify", counting)
     baselines.main(replace(baselines.PRESETS["paper"], resume=folder, targets=2, conditions=("clean",)))
-    assert [method for method, _ in ran] == ["easi", "cma_es", "sysid", "uniform"]
+    assert [method for method, _ in ran] == ["easi", "cma_es", "cma_es_robust", "sysid", "uniform"]
     assert len({seed for _, seed in ran}) == 1 and file.stat().st_mtime_ns == before
     second = json.loads((folder / "clean" / "target_01.json").read_text())
     assert second["budget"] == 480 and second["truth"] != first["truth"], "a resume keeps the run's own budget"
@@ -218,7 +247,10 @@ def test_the_table_by_hand(module: Module) -> None:
     ("options", "message"),
     [
         (("--conditions", "foggy"), "expected --conditions from clean, noisy, outside, got foggy"),
-        (("--methods", "easi", "guess"), "expected --methods from easi, cma_es, sysid, uniform, got guess"),
+        (
+            ("--methods", "easi", "guess"),
+            "expected --methods from easi, cma_es, cma_es_robust, sysid, uniform, got guess",
+        ),
         (("--targets", "0"), "--targets from 1"),
         (("--easi.log", "some.npz"), "leave --easi.log out"),
         (("--easi.search.parameters", "armature"), "leave --easi.search.parameters"),
