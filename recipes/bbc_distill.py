@@ -1,0 +1,201 @@
+"""Join behaviours of several controllers in one: of each run the behaviours that it does best.
+
+Runs of ``bbc_pretrain.py`` differ in which behaviours come out well. Here every behaviour has a teacher, and one
+student learns to act as the teacher of whatever it is told to do, in states that it gets into itself.
+
+Source: ours; the roll-outs of student and labels of a teacher are those of DAgger (Ross, Gordon and Bagnell 2011).
+
+In:  controllers of the same layout (``--teachers BEHAVIOUR PATH BEHAVIOUR PATH ...``, every behaviour once), clips to
+     start episodes from (``--motion.labelled DIR``); without them, synthetic gaits.
+Out: ``runs/NAME/`` with ``config.json`` and ``policy/``; go on with ``bbc_pretrain.py --init-from runs/NAME``, which
+     also trains a discriminator for it.
+
+    python recipes/bbc_distill.py cpu --teachers walk runs/a pace runs/b trot runs/a canter runs/a jump runs/a
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import torch
+from rollouts import Controller, MotionConfig, load_controller, load_motion
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import mse_loss
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from agility_rl import keys
+from agility_rl.behaviours import BEHAVIOURS
+from agility_rl.deploy.artifact import Artifact, build_manifest
+from agility_rl.envs import LocomotionEnv
+from agility_rl.go2 import features
+from agility_rl.losses import AdaptationLoss, StateEstimationLoss
+from agility_rl.modules import BasicBehaviourController
+from agility_rl.training import cli
+from agility_rl.training.seeding import seed_everything
+
+Act = Callable[[TensorDictBase], Tensor]
+Experience = tuple[TensorDictBase, TensorDictBase]
+INPUTS = (keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.HISTORY, keys.COMMAND, keys.PEAK, keys.SKILL)
+LAYOUTS = {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT}
+
+
+@dataclass(frozen=True)
+class Config:
+    name: str = "distilled"
+    """Folder under ``runs``."""
+    runs: Path = Path("runs")
+    seed: int = 0
+    teachers: tuple[tuple[str, Path], ...] = ()
+    """Behaviour and run or artifact folder, for each of the five behaviours. The first one's network is the student's,
+    and its weights are where the student starts."""
+    num_robots: int = 512
+    rounds: int = 24
+    teacher_rounds: int = 2
+    """First rounds in which the teachers act."""
+    steps: int = 50
+    """Control steps of a round."""
+    memory: int = 16
+    """Newest rounds that are learned from."""
+    updates: int = 150
+    """Of a round."""
+    batch_size: int = 4096
+    learning_rate: float = 1e-3
+    noise: float = 0.2
+    """Standard deviation of what is added to the actions that are taken, in action units; labels are without."""
+    episode_length: float = 8.0
+    """Seconds; as in the preset ``cpu`` of ``bbc_pretrain.py``."""
+    num_threads: int | None = None
+    motion: MotionConfig = field(default_factory=MotionConfig)
+
+
+PRESETS = {
+    "cpu": Config(),
+    "smoke": Config(name="smoke", num_robots=20, rounds=3, teacher_rounds=1, steps=20, updates=5, batch_size=128),
+}
+
+
+def load_teachers(cfg: Config) -> list[Controller]:
+    """The teacher of every behaviour, in the order of the behaviours.
+
+    Raises:
+        ValueError: if a behaviour is missing, named twice, or none of the five.
+    """
+    names = [name for name, _ in cfg.teachers]
+    if sorted(names) != sorted(BEHAVIOURS):
+        raise ValueError(
+            f"expected --teachers with every behaviour once ({', '.join(BEHAVIOURS)}), got {', '.join(names) or 'none'}"
+        )
+    loaded = {path: load_controller(path) for path in dict.fromkeys(path for _, path in cfg.teachers)}
+    frictions = {str(path): controller.friction_loss for path, controller in loaded.items()}
+    if len(set(frictions.values())) > 1:
+        raise ValueError(f"expected teachers of one simulator, their joints have dry frictions of {frictions} N m")
+    return [loaded[dict(cfg.teachers)[name]] for name in BEHAVIOURS]
+
+
+def labeller(teachers: list[Controller]) -> Act:
+    """A function that gives the mean action ``[B, 12]`` of the teacher of each row's behaviour."""
+    controllers = {id(teacher.bbc): teacher.bbc for teacher in teachers}
+    own = [list(controllers).index(id(teacher.bbc)) for teacher in teachers]
+    index = torch.tensor(own)
+
+    @torch.no_grad()
+    def label(observation: TensorDictBase) -> Tensor:
+        said = torch.stack([mean_action(bbc, observation) for bbc in controllers.values()])
+        return said[index[observation[keys.SKILL]], torch.arange(len(observation))]
+
+    return label
+
+
+def mean_action(bbc: BasicBehaviourController, observation: TensorDictBase) -> Tensor:
+    """Mean action ``[B, 12]`` of a controller that knows the simulator's parameters; its estimate stays as it is."""
+    inputs = observation.select(keys.PROPRIOCEPTION, keys.PRIVILEGED, keys.COMMAND, keys.PEAK)
+    with torch.no_grad():
+        bbc.estimator(inputs)
+    return bbc.trained_actor()[:-1](inputs)["loc"]
+
+
+def collect(env: LocomotionEnv, carrier: TensorDictBase, act: Act, label: Act, cfg: Config) -> Experience:
+    """Inputs and labels ``[steps * N]`` of a round, and the observation from which the next one goes on."""
+    rows = []
+    for _ in range(cfg.steps):
+        row = carrier.select(*INPUTS).clone()
+        row["label"] = label(row)
+        carrier[keys.ACTION] = act(row) + cfg.noise * torch.randn(row["label"].shape)
+        rows.append(row)
+        _, carrier = env.step_and_maybe_reset(carrier)
+    return torch.cat(rows), carrier
+
+
+def learn(
+    bbc: BasicBehaviourController, replay: TensorDictReplayBuffer, updates: int, optimizer: torch.optim.Optimizer
+) -> None:
+    """Regress on labels, true states and true parameters."""
+    estimation = StateEstimationLoss(bbc.estimator)
+    adaptation = AdaptationLoss(bbc.history_encoder, bbc.privileged_encoder)
+    for _ in range(updates):
+        batch = replay.sample()
+        loss = mse_loss(mean_action(bbc, batch), batch.get("label"))
+        loss = loss + estimation(batch)["loss_estimation"] + adaptation(batch)["loss_adaptation"]
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+
+
+def errors(bbc: BasicBehaviourController, data: TensorDictBase) -> dict[str, float]:
+    """Root mean square of student minus teacher by behaviour, in action units."""
+    with torch.no_grad():
+        squares = (mean_action(bbc, data) - data["label"]).square().mean(-1)
+    return {name: float(squares[data[keys.SKILL] == index].mean().sqrt()) for index, name in enumerate(BEHAVIOURS)}
+
+
+def main(cfg: Config) -> Path:
+    """Distil and save; returns the run folder."""
+    teachers = load_teachers(cfg)
+    seeds = seed_everything(cfg.seed)
+    first = load_controller(cfg.teachers[0][1])
+    bbc = first.bbc
+    motion = load_motion(cfg.motion, first.trained, cfg.seed)
+    folder = cli.start_run(cfg, cfg.runs / cfg.name, recipe="bbc_distill")
+    env = LocomotionEnv(
+        cfg.num_robots,
+        simulator_options={"num_threads": cfg.num_threads, "friction_loss": first.friction_loss},
+        reference=motion.start_states(cfg.seed),
+        episode_length=cfg.episode_length,
+        seed=seeds.integer("environment"),
+    )
+    label, carrier = labeller(teachers), env.reset()
+    optimizer = torch.optim.Adam(bbc.parameters(), lr=cfg.learning_rate)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, cfg.rounds)
+    replay = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(cfg.memory * cfg.steps * cfg.num_robots), batch_size=cfg.batch_size
+    )
+    for number in range(cfg.rounds):
+        act = label if number < cfg.teacher_rounds else partial(mean_action, bbc)
+        with torch.no_grad():
+            rows, carrier = collect(env, carrier, act, label, cfg)
+        found = errors(bbc, rows)
+        print(
+            f"round {number + 1:2d}: " + "  ".join(f"{name} {value:.3f}" for name, value in found.items()), flush=True
+        )
+        replay.extend(rows)
+        learn(bbc, replay, cfg.updates, optimizer)
+        schedule.step()
+    env.close()
+    known = first.artifact.manifest
+    manifest = build_manifest("bbc", LAYOUTS, control_period=env.dt, data=known["data"])
+    manifest |= {name: known[name] for name in ("network", "prior") if name in known}
+    manifest["teachers"] = {
+        name: teacher.artifact.manifest["weights"]["sha256"] for name, teacher in zip(BEHAVIOURS, teachers, strict=True)
+    }
+    Artifact.save(folder / "policy", bbc.state_dict(), manifest)
+    print(f"saved {folder}")
+    return folder
+
+
+if __name__ == "__main__":
+    with cli.one_line_errors():
+        main(cli.from_presets(PRESETS, doc=__doc__))
