@@ -7,10 +7,10 @@ Source: ours; the roll-outs of student and labels of a teacher are those of DAgg
 
 In:  controllers of the same layout (``--teachers BEHAVIOUR PATH BEHAVIOUR PATH ...``, every behaviour once), clips to
      start episodes from (``--motion.labelled DIR``); without them, synthetic gaits.
-Out: ``runs/NAME/`` with ``config.json`` and ``policy/``; go on with ``bbc_pretrain.py --init-from runs/NAME``, which
-     also trains a discriminator for it.
+Out: ``runs/NAME/`` with ``config.json`` and ``policy/``.
 
     python recipes/bbc_distill.py cpu --teachers walk runs/a pace runs/b trot runs/a canter runs/a jump runs/a
+    python recipes/bbc_pretrain.py polish --init-from runs/distilled ...     # PPO goes on, and trains a discriminator
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Presets of stage 1: ``paper`` as published, ``cpu`` tuned for two cores, ``quickstart`` and ``smoke`` cut from it."""
+"""Presets of stage 1: ``paper`` as published, ``cpu`` tuned for two cores, ``polish`` to go on from a controller that
+has all behaviours (``bbc_distill.py``), ``quickstart`` and ``smoke`` cut from ``cpu``."""
 
 from __future__ import annotations
 
@@ -78,6 +79,30 @@ CPU = Config(
     ),
     adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
 )
+POLISH = replace(
+    CPU,
+    name="polish",
+    iterations=240,
+    changes=(),
+    motion=replace(CPU.motion, one_sided=("canter", "jump")),
+    env=replace(CPU.env, progress_weight=4.0, jump_weight=20.0),  # no fading: it walks already
+    ppo=replace(
+        CPU.ppo,
+        learning_rate=1e-4,
+        max_learning_rate=5e-4,
+        desired_kl=0.006,
+        entropy=0.0005,
+        critic_warm_up=20,
+    ),
+    imitation=replace(
+        CPU.imitation,
+        cloning=0,
+        imitation_reward=5.0,
+        information=0.05,
+        information_ramp=(0, 50),
+        prior_weight=5e-3,
+    ),
+)
 QUICKSTART = replace(
     CPU,
     name="quickstart",
@@ -105,4 +130,4 @@ SMOKE = replace(
     ),
     adaptation=replace(CPU.adaptation, every=2),
 )
-PRESETS = {"smoke": SMOKE, "quickstart": QUICKSTART, "cpu": CPU, "paper": PAPER}
+PRESETS = {"smoke": SMOKE, "quickstart": QUICKSTART, "cpu": CPU, "polish": POLISH, "paper": PAPER}
