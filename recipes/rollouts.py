@@ -126,7 +126,7 @@ def load_motion(config: MotionConfig, trained: Mapping[str, Any], seed: int) -> 
 def make_env(
     num_robots: int,
     controller: Controller,
-    reference: TensorDictBase,
+    reference: TensorDictBase | None,
     simulator: SimulatorFile | None = None,
     **options: Any,
 ) -> LocomotionEnv:

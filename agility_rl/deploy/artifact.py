@@ -23,14 +23,22 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 import agility_rl
-from agility_rl.go2 import constants
+from agility_rl.go2 import constants, features
 
 MANIFEST_FILE = "manifest.json"
 FORMAT = "agility_rl.artifact"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""What is written. Version 1 is read too: it had no limits, no normalisers and no checksum of the manifest itself."""
 _PER_JOINT = ("default_pose", "action_scale", "stiffness", "damping")
-REQUIRED = ("kind", "observations", "joint_names", *_PER_JOINT, "control_period", "units", "versions", "data")
+_LIMITS = ("joint_lower", "joint_upper", "joint_speed", "joint_torque")
+_SINCE_2 = ("limits", "normalisers")
+REQUIRED = (
+    *("kind", "observations", "joint_names", *_PER_JOINT, "control_period", "units", "versions", "data"),
+    *_SINCE_2,
+)
 """Entries that every manifest has; :func:`build_manifest` fills them."""
+CHECKSUM = "manifest_sha256"
+"""Entry with the checksum of all others."""
 
 
 class ArtifactError(ValueError):
@@ -94,6 +102,7 @@ class Artifact:
             "sha256": digest,
             "tensors": {name: [str(t.dtype).removeprefix("torch."), list(t.shape)] for name, t in tensors.items()},
         }
+        complete[CHECKSUM] = manifest_checksum(complete)
         _check(complete, "the manifest")
         folder.mkdir(parents=True, exist_ok=True)
         _write(folder / complete["weights"]["file"], weights)
@@ -105,7 +114,7 @@ class Artifact:
 
     @classmethod
     def load(cls, folder: str | Path, *, kind: str | None = None) -> Artifact:
-        """Read an artifact and check it: format, completeness, joint order, checksum, and every tensor's shape.
+        """Read an artifact and check it: format, completeness, joint order, checksums, and every tensor's shape.
 
         Args:
             folder: as given to :meth:`save`.
@@ -125,6 +134,8 @@ class Artifact:
             manifest = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise ArtifactError(f"{path} is damaged: {error}; export the policy again") from error
+        if isinstance(manifest, dict) and manifest.get("format_version") == 1:
+            manifest = {**_implied(), **manifest}
         _check(manifest, str(path))
         if kind is not None and manifest["kind"] != kind:
             raise ArtifactError(f"{path}: expected an artifact of kind {kind!r}, got {manifest['kind']!r}")
@@ -202,6 +213,7 @@ def build_manifest(
     default_pose: Sequence[float] | Tensor = constants.DEFAULT_POSE,
     action_scale: Sequence[float] | Tensor = constants.ACTION_SCALE,
     joint_names: Sequence[str] = constants.JOINT_NAMES,
+    limits: Mapping[str, Sequence[float]] | None = None,
     data: Sequence[str] = (),
     **extra: Any,
 ) -> dict[str, Any]:
@@ -217,6 +229,8 @@ def build_manifest(
         default_pose: joint angles [rad] of action zero.
         action_scale: radians of one action unit, 12.
         joint_names: order of all joint quantities.
+        limits: ``joint_lower``, ``joint_upper`` [rad], ``joint_speed`` [rad/s] and ``joint_torque`` [N·m], 12 each; the
+            Go2's by default.
         data: names of the motion data used, and whether they are synthetic.
         **extra: further JSON values (network sizes, commands, training seed).
 
@@ -237,12 +251,25 @@ def build_manifest(
             "stiffness": "N·m/rad",
             "damping": "N·m·s/rad",
             "control_period": "s",
+            "limits": "rad, rad, rad/s, N·m",
             "joint_target": "default_pose + action_scale * action",
         },
         "versions": _versions(),
         "data": list(data),
+        **_implied(limits),
         **extra,
     }
+
+
+def manifest_checksum(manifest: Mapping[str, Any]) -> str:
+    """SHA-256 of a manifest's entries, its own checksum left out; spaces and order in the file do not count.
+
+    Example:
+        >>> manifest_checksum({"a": 1, "b": 2}) == manifest_checksum({"b": 2, "a": 1, "manifest_sha256": "x"})
+        True
+    """
+    rest = {name: value for name, value in manifest.items() if name != CHECKSUM}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def describe_layout(layout: Iterable[Sequence[Any]]) -> list[dict[str, Any]]:
@@ -258,6 +285,26 @@ def describe_layout(layout: Iterable[Sequence[Any]]) -> list[dict[str, Any]]:
     ]
 
 
+def _implied(limits: Mapping[str, Sequence[float]] | None = None) -> dict[str, Any]:
+    """Entries that version 1 left to the code: limits of the robot, and how inputs are normalised."""
+    robot = {
+        "joint_lower": constants.JOINT_LOWER,
+        "joint_upper": constants.JOINT_UPPER,
+        "joint_speed": constants.VELOCITY_LIMIT,
+        "joint_torque": constants.TORQUE_LIMIT,
+    }
+    return {
+        "limits": {name: list(value) for name, value in {**robot, **(limits or {})}.items()},
+        "normalisers": {
+            "method": "each entry times its scale in observations, then clipped",
+            "clip": features.OBSERVATION_LIMIT,
+            "history": features.HISTORY,
+            "contact_force": features.FOOT_CONTACT_FORCE,
+            "peak_window": features.PEAK_WINDOW,
+        },
+    }
+
+
 def _twelve(value: Sequence[float] | Tensor | float) -> list[float]:
     numbers = value.tolist() if isinstance(value, Tensor) else value
     if isinstance(numbers, int | float):
@@ -268,21 +315,49 @@ def _twelve(value: Sequence[float] | Tensor | float) -> list[float]:
 def _check(manifest: Any, where: str) -> None:
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ArtifactError(f"{where} describes no {FORMAT}")
-    if manifest.get("format_version") != FORMAT_VERSION:
-        version, made = manifest.get("format_version"), manifest.get("versions", {})
-        raise ArtifactError(f"{where} has format version {version}, expected {FORMAT_VERSION}; it was made with {made}")
+    version = manifest.get("format_version")
+    if version not in (1, FORMAT_VERSION):
+        raise ArtifactError(
+            f"{where} has format version {version}, expected 1 or {FORMAT_VERSION}; it was made with "
+            f"{manifest.get('versions', {})}; use that version of agility_rl, or export it again with this one"
+        )
     if missing := [name for name in REQUIRED if name not in manifest]:
         raise ArtifactError(f"{where} lacks {', '.join(missing)}; make it with build_manifest")
+    _check_joints(manifest, where)
+    if not 0.0 < manifest["control_period"] <= 1.0:
+        raise ArtifactError(f"{where}: control_period must be in (0, 1] s, got {manifest['control_period']}")
+    here = _implied()["normalisers"]
+    for name, value in here.items():
+        if (found := manifest["normalisers"].get(name)) != value:
+            raise ArtifactError(f"{where}: the controller was trained with {name} {found}, this code has {value}")
+    if version != 1 and manifest.get(CHECKSUM) != (digest := manifest_checksum(manifest)):
+        raise ArtifactError(
+            f"{where} was altered: its entries have the checksum {digest[:12]}, expected "
+            f"{str(manifest.get(CHECKSUM))[:12]}; copy it again, or export the policy again"
+        )
+
+
+def _check_joints(manifest: Mapping[str, Any], where: str) -> None:
+    """Order of the joints, and numbers for each of them that a robot can have."""
     expected, joints = list(constants.JOINT_NAMES), manifest["joint_names"]
     if joints != expected:
         kind = "the same joints in another order" if sorted(joints) == sorted(expected) else "other joints"
         raise ArtifactError(f"{where} names {kind}: expected {expected}, got {joints}; convert it before use")
-    for name in _PER_JOINT:
-        numbers = manifest[name]
+    if missing := [name for name in _LIMITS if name not in manifest["limits"]]:
+        raise ArtifactError(f"{where}: limits lack {', '.join(missing)}; make it with build_manifest")
+    entries = {name: manifest[name] for name in _PER_JOINT} | {name: manifest["limits"][name] for name in _LIMITS}
+    for name, numbers in entries.items():
         if len(numbers) != len(expected) or not bool(torch.tensor(numbers, dtype=torch.float64).isfinite().all()):
             raise ArtifactError(f"{where}: {name} must be {len(expected)} finite numbers, got {numbers}")
-    if not 0.0 < manifest["control_period"] <= 1.0:
-        raise ArtifactError(f"{where}: control_period must be in (0, 1] s, got {manifest['control_period']}")
+    for name in ("action_scale", "stiffness", "joint_speed", "joint_torque"):
+        if not all(number > 0.0 for number in entries[name]):
+            raise ArtifactError(f"{where}: {name} must be positive, got {entries[name]}")
+    if any(number < 0.0 for number in entries["damping"]):
+        raise ArtifactError(f"{where}: damping must not be negative, got {entries['damping']}")
+    bounds = zip(entries["joint_lower"], entries["default_pose"], entries["joint_upper"], expected)
+    for lower, pose, upper, joint in bounds:
+        if not lower <= pose <= upper:
+            raise ArtifactError(f"{where}: default_pose of {joint} is {pose}, outside its stops {lower} and {upper}")
 
 
 def _versions() -> dict[str, str]:

@@ -14,12 +14,12 @@ from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import features
 
-HISTORY = 10
-"""Frames of proprioception history (released code)."""
-FOOT_CONTACT_FORCE = 2.0
-"""Force on a foot that counts as contact [N], now or one step earlier (released code)."""
-OBSERVATION_LIMIT = 100.0
-"""Measured numbers are clipped to +- this (released code)."""
+# Deployment needs them too, so they stand with the features.
+HISTORY, FOOT_CONTACT_FORCE, OBSERVATION_LIMIT = (
+    features.HISTORY,
+    features.FOOT_CONTACT_FORCE,
+    features.OBSERVATION_LIMIT,
+)
 
 
 class ObservationGroups:

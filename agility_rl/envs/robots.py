@@ -12,11 +12,10 @@ from agility_rl import rotations
 from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.randomization import NOMINAL, Randomization, sample_parameters
 from agility_rl.envs.state import LocomotionState
-from agility_rl.go2 import constants
+from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator
 
-PEAK_WINDOW = 0.9
-"""Seconds over which the highest trunk position counts for a jump."""
+PEAK_WINDOW = features.PEAK_WINDOW
 STRIDE = 0.5
 """Time constant over which a robot's velocity is averaged [s]: a dog does not walk at a constant speed."""
 CLEARANCE = 0.005

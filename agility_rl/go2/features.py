@@ -23,6 +23,14 @@ LINEAR_VELOCITY_SCALE = 0.5
 JOINT_VELOCITY_SCALE = 0.05
 CONTACT_HEIGHT = 0.025
 """A sole lower than this touches the ground [m] (released code's rule for the dog, used for the robot alike)."""
+HISTORY = 10
+"""Frames of proprioception history, the present one included (released code)."""
+FOOT_CONTACT_FORCE = 2.0
+"""Force on a foot that counts as contact [N], now or one control step earlier (released code)."""
+OBSERVATION_LIMIT = 100.0
+"""Measured numbers are clipped to +- this (released code)."""
+PEAK_WINDOW = 0.9
+"""Seconds over which the highest trunk position counts for a jump."""
 
 
 class Entry(NamedTuple):

@@ -117,12 +117,18 @@ def tamper(folder: Path, **changes: Any) -> None:
         ({"joint_names": [*constants.JOINT_NAMES[3:], *constants.JOINT_NAMES[:3]]}, "the same joints in another order"),
         ({"joint_names": ["a"] * 12}, "names other joints"),
         ({"format": "other"}, "describes no agility_rl.artifact"),
-        ({"format_version": 2}, "has format version 2, expected 1"),
+        ({"format_version": 3}, "has format version 3, expected 1 or 2; .* use that version of agility_rl"),
         ({"stiffness": [40.0] * 11}, "stiffness must be 12 finite numbers"),
         ({"damping": [float("nan")] * 12}, "damping must be 12 finite numbers"),
         ({"control_period": 20}, r"control_period must be in \(0, 1\] s, got 20"),
-        ({"weights": {}}, "weights must be a file beside the manifest"),
-        ({"weights": {"file": "../x.safetensors"}}, "weights must be a file beside the manifest"),
+        ({"stiffness": [-40.0] * 12}, "stiffness must be positive"),
+        ({"damping": [-1.0] * 12}, "damping must not be negative"),
+        ({"default_pose": [0.0, 0.9, 1.8] * 4}, "default_pose of FL_calf_joint is 1.8, outside its stops"),
+        ({"limits": {}}, "limits lack joint_lower"),
+        ({"normalisers": {}}, "the controller was trained with method None"),
+        ({"stiffness": [41.0] * 12}, r"manifest.json was altered: its entries have the checksum"),
+        ({"note": "harmless"}, r"manifest.json was altered"),
+        ({"manifest_sha256": None}, r"was altered.*expected None; copy it again"),
     ],
 )
 def test_a_manifest_that_does_not_fit_is_refused(
@@ -141,6 +147,39 @@ def test_every_required_entry_is_required(tmp_path: Path, manifest: dict[str, An
     with pytest.raises(ArtifactError, match=f"lacks {name}; make it with build_manifest"):
         Artifact.save(tmp_path, state(), manifest)
     assert not list(tmp_path.iterdir()), "nothing was written"
+
+
+def as_version_1(folder: Path) -> None:
+    """What agility_rl wrote before limits, normalisers and the manifest's checksum were part of it."""
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    for name in ("limits", "normalisers", "manifest_sha256"):
+        del manifest[name]
+    path.write_text(json.dumps({**manifest, "format_version": 1}))
+
+
+def test_version_1_is_still_read(tmp_path: Path, manifest: dict[str, Any]) -> None:
+    Artifact.save(tmp_path, state(), manifest)
+    as_version_1(tmp_path)
+    loaded = Artifact.load(tmp_path, kind="bbc")
+    assert loaded.manifest["format_version"] == 1
+    assert loaded.manifest["limits"]["joint_torque"] == list(constants.TORQUE_LIMIT)
+    assert loaded.manifest["normalisers"] == manifest["normalisers"]
+
+
+@pytest.mark.parametrize("weights", [{}, {"file": "../x.safetensors"}])
+def test_weights_elsewhere_are_refused(tmp_path: Path, manifest: dict[str, Any], weights: dict[str, str]) -> None:
+    Artifact.save(tmp_path, state(), manifest)
+    as_version_1(tmp_path)  # where no checksum speaks first
+    tamper(tmp_path, weights=weights)
+    with pytest.raises(ArtifactError, match="weights must be a file beside the manifest"):
+        Artifact.load(tmp_path)
+
+
+def test_spaces_in_the_manifest_do_not_count(tmp_path: Path, manifest: dict[str, Any]) -> None:
+    Artifact.save(tmp_path, state(), manifest)
+    tamper(tmp_path)  # rewrites it without indentation
+    assert Artifact.load(tmp_path).manifest["kind"] == "bbc"
 
 
 def test_damaged_weights_are_refused(tmp_path: Path, manifest: dict[str, Any]) -> None:

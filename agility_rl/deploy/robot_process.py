@@ -1,0 +1,191 @@
+"""A simulated robot in a process of its own, in real time: 1,000 Hz motors, 500 Hz states, as the Go2 has them."""
+
+from __future__ import annotations
+
+import json
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
+
+import torch
+
+from agility_rl.deploy.loopback import (
+    COMMAND,
+    GREETING,
+    HOST,
+    LARGEST,
+    NAMES,
+    Commanders,
+    PacketError,
+    pack_state,
+    seal,
+    unpack_command,
+    unseal,
+)
+from agility_rl.deploy.simulated import SimulatedRobot
+from agility_rl.go2 import constants
+
+STATE_PERIOD = 0.002
+"""Time between two states [s]: 500 Hz."""
+MOST_BEHIND = 0.02
+"""Simulated time that is made up for after a delay [s]; what is lost beyond it makes the robot slower than life."""
+SETTLE_SECONDS = 1.0
+"""Simulated time in which the robot comes to rest before anybody may command it [s]."""
+PATIENCE = 10.0
+"""Time that the process gets to end by itself [s]."""
+LISTENER_MEMORY = 2.0
+"""Time without a word after which a listener gets no more states [s]."""
+
+
+class RobotServer:
+    """Steps a simulated robot in real time, obeys the commands that arrive, and tells its state to who asked.
+
+    Source: supplement S3 (motors at 1,000 Hz).
+
+    Args:
+        robot: what is stepped.
+        port: to listen on; 0 takes a free one.
+
+    Attributes:
+        port: the port.
+        rejected: packets that were damaged or unknown.
+        lost: simulated seconds that could not be made up for.
+    """
+
+    def __init__(self, robot: SimulatedRobot, port: int = 0) -> None:
+        self.robot = robot
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((HOST, port))
+        self._socket.setblocking(False)
+        self.port: int = self._socket.getsockname()[1]
+        self.commanders = Commanders()
+        self.rejected, self.lost = 0, 0.0
+        self._listeners: dict[tuple[str, int], float] = {}
+
+    def serve(self, seconds: float | None = None, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Run in real time until told to stop, or for some time."""
+        begun = due = time.monotonic()
+        while not stopped() and (seconds is None or time.monotonic() - begun < seconds):
+            due += STATE_PERIOD
+            now = time.monotonic()
+            if now < due:
+                time.sleep(due - now)
+            elif now - due > MOST_BEHIND:
+                self.lost += now - due - MOST_BEHIND
+                due = now - MOST_BEHIND
+            self.receive()
+            self.robot.advance(STATE_PERIOD)
+            self.publish()
+
+    def receive(self) -> None:
+        """Take everything that has arrived; the newest command counts, whoever sent it."""
+        while True:
+            try:
+                packet, sender = self._socket.recvfrom(LARGEST)
+            except (BlockingIOError, ConnectionRefusedError):
+                return
+            now = time.monotonic()
+            try:
+                kind, body = unseal(packet)
+                if kind == COMMAND:
+                    command, session = unpack_command(body)
+                    self.robot.command(command)
+                    self.commanders.heard(session, now)
+                elif kind == GREETING:
+                    self._socket.sendto(seal(NAMES, json.dumps(constants.JOINT_NAMES).encode()), sender)
+                else:
+                    self.rejected += 1
+                    continue
+                self._listeners[sender] = now
+            except PacketError:
+                self.rejected += 1
+
+    def publish(self) -> None:
+        """Tell the state to everybody who has lately been heard."""
+        now = time.monotonic()
+        self._listeners = {who: last for who, last in self._listeners.items() if now - last <= LISTENER_MEMORY}
+        if self._listeners:
+            packet = pack_state(self.robot.state(now), self.commanders.count(now))
+            for listener in self._listeners:
+                try:
+                    self._socket.sendto(packet, listener)
+                except (ConnectionRefusedError, BlockingIOError):
+                    continue
+
+    def close(self) -> None:
+        """Release the socket."""
+        self._socket.close()
+
+
+class RobotProcess:
+    """Context manager that runs a :class:`RobotServer` in a process of its own.
+
+    Args:
+        pose: ``lying`` or ``standing``.
+        port: to listen on; 0 takes a free one.
+        **robot_options: keyword arguments of :class:`agility_rl.deploy.simulated.SimulatedRobot`, as JSON values.
+
+    Attributes:
+        port: where to reach it.
+        lost: simulated seconds by which it fell behind; known after the end.
+
+    Raises:
+        RuntimeError: if the process does not come up.
+    """
+
+    def __init__(self, *, pose: str = "lying", port: int = 0, **robot_options: Any) -> None:
+        command = [sys.executable, "-m", __name__, json.dumps({"pose": pose, "port": port, **robot_options})]
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
+        self.lost = 0.0
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            self._process.communicate()
+            raise RuntimeError(
+                f"the robot's process ended with status {self._process.returncode} before it began; see its message"
+            )
+        self.port: int = json.loads(line)["port"]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the process; calling it again does nothing."""
+        if self._process.returncode is not None:
+            return
+        try:
+            output, _ = self._process.communicate(timeout=PATIENCE)  # closes its input, at which it ends
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            output, _ = self._process.communicate()
+        if output:
+            self.lost = float(json.loads(output)["lost"])
+
+
+def main(options: dict[str, Any]) -> None:
+    """Body of the process: says its port, and ends when its input is closed, also by the death of who started it."""
+    robot = SimulatedRobot(**{name: value for name, value in options.items() if name not in ("pose", "port")})
+    robot.reset(options["pose"])
+    robot.advance(SETTLE_SECONDS)
+    server = RobotServer(robot, options["port"])
+    sys.stdout.write(json.dumps({"port": server.port}) + "\n")
+    sys.stdout.flush()
+    server.serve(stopped=lambda: bool(select.select([sys.stdin], [], [], 0)[0]))
+    server.close()
+    sys.stdout.write(json.dumps({"lost": server.lost}) + "\n")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(json.loads(sys.argv[1]))

@@ -1,0 +1,268 @@
+"""Run a controller at 50 Hz in real time against a robot: for now a simulated one, in a process of its own.
+
+The robot stands up, moves in the behaviour that is asked for, stops, and sinks down. Ctrl-C stops it at once, as every
+fault does. The process that runs this is the operator.
+
+In:  an artifact folder (or a run), best after recipes/export.py.
+Out: one MCAP file that opens in Foxglove and rerun, and is a robot log for recipes/easi.py.
+
+    python recipes/deploy.py pretrained/bbc --transport mujoco --seconds 20 --skill trot --speed 1.0
+
+Status: 0 if all went well, 1 if a fault ended the run or it never began.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+import tyro
+
+from agility_rl import rotations
+from agility_rl.behaviours import COMMANDS
+from agility_rl.collectors.log_formats import AXES
+from agility_rl.deploy import Artifact, BehaviourCommand, Controller, DeployedBBC, Mode, Operator, SafetyLimits
+from agility_rl.deploy.behaviour import onnx_network, torch_network
+from agility_rl.deploy.controller import StepRecord
+from agility_rl.deploy.deadlines import Clock, Durations, MonotonicClock
+from agility_rl.deploy.loopback import LoopbackTransport
+from agility_rl.deploy.robot_process import RobotProcess
+from agility_rl.go2 import constants, features
+from agility_rl.record import EpisodeRecorder
+from agility_rl.training import cli
+
+SINK_SECONDS = 1.5
+"""Time for which damping is still commanded at the end, while the robot sinks down."""
+PATIENCE = 3.0
+"""Time for which a refused request is repeated [s]."""
+SHOWN_MISSES = 20
+"""Missed deadlines that are listed one by one."""
+READY_SECONDS = 0.5
+"""Time for which the robot stands before it starts."""
+
+
+@dataclass(frozen=True)
+class Config:
+    artifact: Annotated[Path, tyro.conf.Positional]
+    """Artifact folder of a BBC, or a run with one."""
+    transport: Literal["mujoco"] = "mujoco"
+    """What to drive."""
+    seconds: float = 20.0
+    """Time in the behaviour, without standing up and sinking down."""
+    skill: str = "trot"
+    """Behaviour: walk, pace, trot, canter or jump."""
+    speed: float | None = None
+    """Forward velocity [m/s], kept inside the behaviour's range (Table S2); its middle by default."""
+    yaw_rate: float = 0.0
+    """Turn rate [rad/s], likewise."""
+    height: float | None = None
+    """Trunk height, of a jump the highest [m], likewise."""
+    backend: Literal["torch", "onnx"] = "torch"
+    """What computes the network; onnx needs an exported artifact and onnxruntime."""
+    output: Path | None = None
+    """File to record to, ending in .mcap; ``runs/deploy/deploy_N.mcap`` by default. Nothing is overwritten."""
+    pose: Literal["lying", "standing"] = "lying"
+    """How the simulated robot waits."""
+    sim_dt: float = 0.001
+    """Step of the simulated physics and motors [s] (1,000 Hz: supplement S3)."""
+    friction_loss: float | None = None
+    """Dry friction of the simulated joints [N m]; as in training by default."""
+    state_age: float = SafetyLimits.state_age
+    """Oldest state to act on [s]."""
+    missed_deadlines: int = SafetyLimits.missed_deadlines
+    """Missed control steps in a row that end the run."""
+    operator_age: float = 0.5
+    """Time without a word of the operator that ends the run [s]."""
+
+
+class Recorder:
+    """Writes every control step: for eyes, and in the form of a robot log.
+
+    Rows into which no transition of the behaviour controller leads have ``start`` 1: standing up, damping, and steps
+    after a missed one.
+    """
+
+    def __init__(self, episode: EpisodeRecorder, bbc: DeployedBBC) -> None:
+        self.episode, self.bbc = episode, bbc
+        self._begun: float | None = None
+
+    def __call__(self, step: StepRecord) -> None:
+        """Write one control step, once the robot has spoken."""
+        state = step.state
+        if state is None:
+            return
+        self._begun = step.time if self._begun is None else self._begun
+        action = step.action
+        if action is None:
+            driven = step.command.stiffness > 0
+            action = torch.where(driven, (step.command.position - self.bbc.default_pose) / self.bbc.action_scale, 0.0)
+        height = float(step.estimate[0]) if step.estimate is not None else 0.0
+        position = torch.tensor([0.0, 0.0, height]) if state.trunk_position is None else state.trunk_position
+        roll, pitch, _ = rotations.to_euler(state.quaternion)
+        command = torch.zeros(len(COMMANDS)) if step.behaviour is None else step.behaviour.command
+        self.episode.record(
+            position,
+            state.quaternion,
+            state.joint_position,
+            joint_velocity=state.joint_velocity,
+            joint_torque=state.joint_torque,
+            foot_contact=state.foot_force > features.FOOT_CONTACT_FORCE,
+            signals={
+                "roll_pitch": {"roll": float(roll), "pitch": float(pitch)},
+                "angular_velocity": dict(zip(AXES, state.angular_velocity.tolist(), strict=True)),
+                "linear_acceleration": dict(zip(AXES, state.linear_acceleration.tolist(), strict=True)),
+                "action": dict(zip(constants.JOINT_NAMES, action.tolist(), strict=True)),
+                "start": {"value": float(not step.continues)},
+                "command": dict(zip(COMMANDS, command.tolist(), strict=True)),
+                "controller": {
+                    "mode": str(step.mode),
+                    "behaviour": "" if step.behaviour is None else step.behaviour.name,
+                    "estimated_height": height,
+                },
+                "foot_force": dict(zip(constants.LEGS, state.foot_force.tolist(), strict=True)),
+                "timing": {
+                    "time": step.time - self._begun,
+                    "state_age": step.time - state.time,
+                    "lateness": step.lateness,
+                    "duration": step.duration,
+                },
+            },
+        )
+
+
+class Course:
+    """Asks for one mode after the other: stand up, run for some time, stop, sink down."""
+
+    def __init__(self, controller: Controller, operator: Operator, seconds: float) -> None:
+        self.controller, self.operator, self.seconds = controller, operator, seconds
+        self.finished = False
+        self._since: tuple[Mode, float] | None = None
+        self._ran = False
+
+    def __call__(self, step: StepRecord) -> None:
+        """Decide after every control step what to ask for next."""
+        self.operator.heard(step.time)
+        if self._since is None or self._since[0] is not step.mode:
+            self._since = (step.mode, step.time)
+        elapsed = step.time - self._since[1]
+        if step.mode is Mode.PASSIVE and step.state is not None:
+            self.finished = elapsed > PATIENCE  # every request was refused; the log says why
+            self.controller.request(Mode.STAND_UP)
+        elif step.mode is Mode.READY and (self._ran or elapsed > PATIENCE):
+            self.finished = True
+        elif step.mode is Mode.READY and elapsed >= READY_SECONDS:
+            self.controller.request(Mode.RUN)
+        elif step.mode is Mode.RUN and elapsed >= self.seconds:
+            self._ran = True
+            self.controller.request(Mode.STAND_UP)
+        elif step.mode is Mode.DAMPING:
+            self.finished = True
+
+
+def free_file(folder: Path) -> Path:
+    """``deploy_N.mcap`` with the first N that is free."""
+    number = 0
+    while (folder / f"deploy_{number}.mcap").exists():
+        number += 1
+    return folder / f"deploy_{number}.mcap"
+
+
+def load(cfg: Config) -> tuple[Artifact, DeployedBBC]:
+    """The controller, ready to run."""
+    folder = cfg.artifact / "policy" if (cfg.artifact / "policy").is_dir() else cfg.artifact
+    artifact = Artifact.load(folder, kind="bbc")
+    network = onnx_network(artifact) if cfg.backend == "onnx" else torch_network(artifact)
+    return artifact, DeployedBBC(network, artifact)
+
+
+def summary(controller: Controller, lost: float, started: float) -> str:
+    """What the loop did, in lines."""
+
+    def quantiles(durations: Durations) -> str:
+        values = (1e3 * durations.quantile(share) for share in (0.5, 0.99))
+        return "p50 {:.2f} ms, p99 {:.2f} ms, ".format(*values) + f"longest {1e3 * durations.largest:.1f} ms"
+
+    deadlines = controller.deadlines
+    share = deadlines.misses / max(deadlines.periods, 1)
+    missed = [event for event in controller.events if event.kind == "missed"]
+    shown = [event for event in controller.events if event.kind != "missed" or event in missed[:SHOWN_MISSES]]
+    lines = [f"{event.time - started:7.2f} s  {event.mode:9}  {event.reason}" for event in shown]
+    if len(missed) > SHOWN_MISSES:
+        lines.append(f"... and {len(missed) - SHOWN_MISSES} more misses; the recording has the timing of every step")
+    lines += [
+        f"control steps: {deadlines.periods}, missed {deadlines.misses} ({share:.2%})",
+        f"one step: {quantiles(deadlines.durations)}",
+        f"late by: {quantiles(deadlines.latenesses)}",
+        f"the simulated robot lost {lost:.3f} s against real time",
+    ]
+    return "\n".join(lines)
+
+
+def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[Path, Controller]:
+    """Run, record, print what happened."""
+    command = BehaviourCommand.of(cfg.skill, velocity_x=cfg.speed, yaw_rate=cfg.yaw_rate, height=cfg.height)
+    artifact, bbc = load(cfg)
+    path = free_file(Path("runs") / "deploy") if cfg.output is None else cfg.output
+    if path.suffix != ".mcap" or path.exists():
+        raise ValueError(f"expected --output to be a new file that ends in .mcap, got {path}")
+    friction = artifact.manifest.get("simulation", {}).get("friction_loss", 0.0)
+    robot_options: dict[str, Any] = {
+        "pose": cfg.pose,
+        "sim_dt": cfg.sim_dt,
+        "friction_loss": friction if cfg.friction_loss is None else cfg.friction_loss,
+    }
+    metadata = {"weights": artifact.manifest["weights"]["sha256"], "robot": robot_options, "versions": cli.versions()}
+    limits = SafetyLimits.from_manifest(
+        artifact.manifest,
+        state_age=cfg.state_age,
+        source_age={"operator": cfg.operator_age},
+        missed_deadlines=cfg.missed_deadlines,
+    )
+    with RobotProcess(**robot_options) as robot, EpisodeRecorder(path, dt=bbc.period, metadata=metadata) as episode:
+        transport = LoopbackTransport(robot.port, patience=60.0)
+        started = clock.now()
+        operator = Operator(command, started)
+        controller = Controller(transport, bbc, operator, limits=limits, clock=clock)
+        record, course = Recorder(episode, bbc), Course(controller, operator, cfg.seconds)
+
+        def on_step(step: StepRecord) -> None:
+            record(step)
+            course(step)
+
+        controller.on_step = on_step
+        gc.collect()
+        gc.freeze()  # what was loaded until here need not be looked through again in the middle of a step
+        try:
+            controller.run(until=lambda: course.finished or interrupted())
+            controller.on_step = record
+            for _ in range(round(SINK_SECONDS / bbc.period)):
+                controller.step()
+        finally:
+            gc.unfreeze()
+            transport.close()
+    print(summary(controller, robot.lost, started))
+    print(f"recorded: {path}, {episode.num_steps} steps")
+    return path, controller
+
+
+def main(cfg: Config) -> int:
+    """Returns the exit status."""
+    logging.getLogger("agility_rl.deploy").setLevel(logging.ERROR)  # the summary lists the events
+    torch.set_num_threads(1)
+    with cli.interruptible() as interrupted:
+        _, controller = drive(cfg, MonotonicClock(), interrupted)
+    if controller.fault is not None:
+        print(f"fault: {controller.fault}")
+    ran = any(event.mode is Mode.RUN for event in controller.events)
+    return 0 if ran and controller.fault is None else 1
+
+
+if __name__ == "__main__":
+    with cli.one_line_errors():
+        sys.exit(main(tyro.cli(Config, description=__doc__)))

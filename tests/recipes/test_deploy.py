@@ -1,0 +1,90 @@
+"""A short run in real time against the robot's process, and what it leaves behind."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from agility_rl.collectors import RobotLog
+from agility_rl.deploy import BehaviourCommand, Mode, RobotState
+from agility_rl.deploy.controller import StepRecord
+from agility_rl.deploy.transport import JointCommand
+from agility_rl.go2 import constants
+from agility_rl.record import EpisodeRecorder, read_episode
+
+Module = Callable[[str], ModuleType]
+
+
+@pytest.fixture
+def deploy(module: Module) -> ModuleType:
+    return module("deploy")
+
+
+def test_a_run_is_recorded_as_a_robot_log(
+    deploy: ModuleType, untrained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # However slow the machine that runs the tests, its deadlines are not what is tested here.
+    patient = {"state_age": 600.0, "operator_age": 600.0, "missed_deadlines": 10**9}
+    path = tmp_path / "run.mcap"
+    cfg = deploy.Config(
+        untrained, seconds=2.0, skill="walk", output=path, pose="standing", friction_loss=0.0, **patient
+    )
+    begin = time.monotonic()
+    assert deploy.main(cfg) == 0, capsys.readouterr().out
+    assert time.monotonic() - begin > 2.5 + 0.5 + 2.0 + 1.0 + 1.5, "in real time"
+    printed = capsys.readouterr().out
+    assert "run        requested" in printed and "control steps:" in printed and "p99" in printed
+    log, episode = RobotLog.load(path), read_episode(path)
+    running = episode["controller/estimated_height"] != 0.0
+    steps = (~log.start).sum()
+    assert 0 < len(log.transitions()) == steps < running.sum(), "only the behaviour controller's own steps count"
+    assert bool(running[~log.start].all())
+    assert episode["timing/duration"].min() > 0.0 and (episode["timing/time"].diff() > 0).all()
+    assert 0.2 < episode["root_position"][running][:, 2].median() < 0.35
+
+
+def test_a_file_is_never_overwritten_and_a_bad_name_is_named(
+    deploy: ModuleType, untrained: Path, tmp_path: Path
+) -> None:
+    taken = tmp_path / "taken.mcap"
+    taken.write_bytes(b"mine")
+    for path in (taken, tmp_path / "log.csv"):
+        with pytest.raises(ValueError, match=r"a new file that ends in \.mcap"):
+            deploy.main(deploy.Config(untrained, output=path))
+    assert taken.read_bytes() == b"mine"
+    with pytest.raises(ValueError, match="'gallop' is no behaviour"):
+        deploy.main(deploy.Config(untrained, skill="gallop"))
+
+
+def test_what_a_row_holds(deploy: ModuleType, untrained: Path, tmp_path: Path) -> None:
+    _, bbc = deploy.load(deploy.Config(untrained))
+    state = replace(RobotState.standing(time=1.0), joint_velocity=torch.arange(12.0), foot_force=torch.zeros(4))
+    hold = JointCommand(bbc.target(torch.full((12,), 0.5)), bbc.stiffness, bbc.damping)
+    standing = StepRecord(1.01, Mode.STAND_UP, state, hold, None, None, None, False, 0.001, 0.0)
+    action = torch.linspace(-1.0, 1.0, 12)
+    moving = replace(standing, mode=Mode.RUN, action=action, behaviour=BehaviourCommand.of("trot", velocity_x=0.8))
+    moving = replace(moving, estimate=torch.tensor([0.31, 0.0, 0.0, 0.0]))
+    limp = replace(standing, mode=Mode.DAMPING, command=JointCommand.damped(3.0))
+    path = tmp_path / "rows.mcap"
+    with EpisodeRecorder(path, dt=0.02) as episode:
+        recorder = deploy.Recorder(episode, bbc)
+        recorder(replace(standing, state=None))
+        for step in [standing, moving, replace(moving, continues=True), limp]:
+            recorder(step)
+    log, rows = RobotLog.load(path, min_steps=2), read_episode(path)
+    assert log.start.tolist() == [True, True, False, True] and len(log.transitions()) == 1
+    assert torch.allclose(log.action[0], torch.full((12,), 0.5), atol=1e-5), "held while standing up, in action units"
+    assert torch.allclose(log.action[1], action, atol=1e-6) and not log.action[3].any()
+    assert torch.equal(log.joint_velocity[0], torch.arange(12.0)) and log.linear_acceleration[0, 2] > 9.8
+    assert rows["command/velocity_x"].tolist() == pytest.approx([0.0, 0.8, 0.8, 0.0])
+    assert rows["root_position"][1].tolist() == pytest.approx([0.0, 0.0, 0.31]), (
+        "the estimate, where nothing measures it"
+    )
+    assert rows["timing/state_age"].tolist() == pytest.approx([0.01] * 4) and not rows["foot_contact"].any()
+    assert torch.allclose(log.joint_position[0], torch.tensor(constants.DEFAULT_POSE))

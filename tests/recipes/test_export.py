@@ -1,0 +1,91 @@
+"""The export: complete, checked against the training policy and onnxruntime, and refused where they differ."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from agility_rl.deploy.artifact import Artifact, ArtifactError
+from agility_rl.deploy.behaviour import BBCNetwork, onnx_network, torch_network
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxscript")
+Module = Callable[[str], ModuleType]
+
+
+@pytest.fixture
+def export(module: Module) -> ModuleType:
+    return module("export")
+
+
+def as_version_1(run: Path) -> None:
+    path = run / "policy" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    for name in ("limits", "normalisers", "manifest_sha256"):
+        del manifest[name]
+    path.write_text(json.dumps({**manifest, "format_version": 1}))
+
+
+def test_an_export_in_place_completes_an_old_artifact(export: ModuleType, untrained: Path) -> None:
+    as_version_1(untrained)
+    before = Artifact.load(untrained / "policy")
+    folder = export.main(export.Config(untrained, steps=8))
+    assert folder == untrained / "policy"
+    artifact = Artifact.load(folder, kind="bbc")
+    assert artifact.manifest["format_version"] == 2
+    assert artifact.manifest["weights"] == before.manifest["weights"]
+    assert (
+        artifact.manifest["versions"] == before.manifest["versions"] and "torch" in artifact.manifest["exported_with"]
+    )
+    entry = artifact.manifest["onnx"]
+    assert entry["checked_on"] == "40 recorded inputs" and entry["largest_difference"] <= 1e-5
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        ["manifest.json", entry["file"], artifact.manifest["weights"]["file"]]
+    )
+    # On inputs that the check has not seen, and with the contract inside the file.
+    generator = torch.Generator().manual_seed(7)
+    inputs = [torch.randn(1, *shape, generator=generator) for shape in ((45,), (10, 45), (11,), (1,))]
+    for ours, theirs in zip(torch_network(artifact)(*inputs), onnx_network(artifact)(*inputs), strict=True):
+        assert (ours - theirs).abs().max() <= 1e-5
+    metadata = {entry.key: json.loads(entry.value) for entry in onnx.load(folder / entry["file"]).metadata_props}
+    assert metadata["joint_names"][0] == "FL_hip_joint" and metadata["stiffness"] == [40.0] * 12
+    assert metadata["weights_sha256"] == artifact.manifest["weights"]["sha256"]
+    assert str(folder) not in (folder / entry["file"]).read_bytes().decode("latin-1")
+
+
+def test_a_mismatch_is_refused_and_nothing_is_written(
+    export: ModuleType, untrained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    convert = export.to_onnx
+
+    def of_another_network(network: BBCNetwork, metadata: dict) -> bytes:
+        other = copy.deepcopy(network)
+        other.mean.layers[-1].bias += 2e-5
+        return convert(other, metadata)
+
+    monkeypatch.setattr(export, "to_onnx", of_another_network)
+    output = tmp_path / "exported"
+    with pytest.raises(ArtifactError, match=r"onnxruntime and PyTorch differ by 2\.\d\de-05 on 10 recorded inputs"):
+        export.main(export.Config(untrained, output=output, steps=2))
+    assert list(output.iterdir()) == []
+
+
+def test_a_network_that_is_not_the_trained_policy_is_refused(export: ModuleType, untrained: Path) -> None:
+    controller = export.load_controller(untrained)
+    seen = export.recorded_inputs(controller, 2, 0)
+    network = copy.deepcopy(BBCNetwork(controller.bbc))
+    with torch.no_grad():
+        network.mean.layers[-1].bias += 1e-5
+    with pytest.raises(ArtifactError, match=r"differs from the training policy by 1\.0"):
+        export.check_network(controller, network, seen, untrained)
+
+
+def test_steps_must_be_positive(export: ModuleType, untrained: Path) -> None:
+    with pytest.raises(ValueError, match="--steps of at least 1"):
+        export.main(export.Config(untrained, steps=0))
