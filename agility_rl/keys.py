@@ -84,3 +84,27 @@ OUTCOME = "outcome"
 
 TERMINATIONS = "terminations"
 """nested: one bool ``[*B, 1]`` per reason for which an episode fails, true in the step in which it holds."""
+
+DEPTH = "depth"
+"""float32 ``[*B, 58, 87]``, normalised depth image in [-0.5, 0.5], near is small; stored as uint8 or int16 too."""
+
+DEPTH_FEATURE = "depth_feature"
+"""float32 ``[*B, 32]``, what the depth encoder makes of one image."""
+
+HIDDEN = "hidden"
+"""float32 ``[*B, 512]``, the student's memory before a step."""
+
+HEADING_ESTIMATE = "heading_estimate"
+"""float32 ``[*B, 2]``, the student's guess of :data:`HEADING_ERROR` [rad]."""
+
+OBSTACLE_LOGITS = "obstacle_logits"
+"""float32 ``[*B, 7]``, the student's unnormalised log-probabilities of :data:`OBSTACLE`."""
+
+LABEL = "label"
+"""nested: what the teacher would do, ``behaviour`` int64 ``[*B]`` and ``parameters`` float32 ``[*B, K, 6]``."""
+
+PROJECTION = "projection"
+"""float32 ``[*B, 64]``, BYOL's projection of an image's feature."""
+
+PREDICTION = "prediction"
+"""float32 ``[*B, 64]``, BYOL's prediction of the projection of the same image seen otherwise."""

@@ -49,6 +49,10 @@ PUBLIC: dict[str, tuple[str, ...]] = {
         "PrivilegedEncoder",
         "ScandotsEncoder",
         "TransitionDiscriminator",
+        "BYOL",
+        "DepthAugmentation",
+        "DepthEncoder",
+        "RecurrentStudent",
     ),
     "losses": (
         "DiscriminatorLoss",
@@ -57,10 +61,13 @@ PUBLIC: dict[str, tuple[str, ...]] = {
         "AdaptationLoss",
         "StateEstimationLoss",
         "TransitionDiscriminatorLoss",
+        "BYOLLoss",
+        "StudentLoss",
     ),
     "envs": ("AgilityEnv", "Course", "LocomotionEnv"),
     "collectors": (
         "BehaviourPolicy",
+        "DAggerCollector",
         "EASICollector",
         "EvolutionStrategy",
         "ParameterSpace",
@@ -71,7 +78,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "motion": ("MotionClip", "MotionDataset", "load_clip", "retarget", "synthesize_gait", "classify_gait"),
     "simulation": ("Simulator", "make_simulator"),
     "record": ("MCAPLogger", "EpisodeRecorder"),
-    "deploy": ("Artifact",),
+    "deploy": ("Artifact", "Controller", "DeployedBBC", "BehaviourCommand", "Operator"),
 }
 """Names that users import. Taking one away breaks their code: do it on purpose, here and in the changelog."""
 

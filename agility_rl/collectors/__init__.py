@@ -1,8 +1,9 @@
-"""What gathers data and searches with it: EASI's collector, its evolution strategy, and robot logs."""
+"""What gathers data and searches with it: EASI's collector, its evolution strategy, robot logs, and DAgger."""
 
 from __future__ import annotations
 
 from agility_rl.collectors.behaviour_policy import BehaviourPolicy
+from agility_rl.collectors.dagger import DAggerCollector
 from agility_rl.collectors.easi import EASICollector, one_thread
 from agility_rl.collectors.evolution import EvolutionStrategy
 from agility_rl.collectors.log_formats import RobotLogError
@@ -17,6 +18,7 @@ from agility_rl.collectors.windows import Windows, cut_windows
 __all__ = [
     "GAINS",
     "BehaviourPolicy",
+    "DAggerCollector",
     "EASICollector",
     "EvolutionStrategy",
     "Parameter",

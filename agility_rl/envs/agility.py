@@ -20,6 +20,7 @@ from agility_rl.envs.arena import Arena
 from agility_rl.envs.course import Course
 from agility_rl.envs.course_presets import full_course
 from agility_rl.envs.decisions import COMMAND_NOISE, NUM_PARAMETERS, Decisions
+from agility_rl.envs.depth import DepthObservation
 from agility_rl.envs.observations import HISTORY, ObservationGroups
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.envs.outcome import DecisionOutcome, outcome_specs
@@ -27,7 +28,7 @@ from agility_rl.envs.progress import GOAL_RADIUS, Events
 from agility_rl.envs.randomization import Randomization
 from agility_rl.envs.robots import Pushes, Robots
 from agility_rl.envs.scandots import NUM_SCANDOTS
-from agility_rl.go2 import features, kinematics
+from agility_rl.go2 import camera, features, kinematics
 from agility_rl.simulation import Simulator, make_simulator
 
 Controller = Callable[[TensorDictBase], TensorDictBase]
@@ -55,7 +56,8 @@ class AgilityEnv(EnvBase):
 
     Keys written, beside those of :class:`LocomotionEnv` (where ``command``, ``skill`` and ``shift`` are now the last
     decision's): ``heading_error`` [N, 2], ``obstacle`` [N, 7], ``scandots`` [N, 132], ``(outcome, name)`` bool
-    [N, 1] or [N, 7], ``(terminations, name)`` bool [N, 1]. Units stand in :mod:`agility_rl.keys`.
+    [N, 1] or [N, 7], ``(terminations, name)`` bool [N, 1], and with a camera ``depth`` [N, 58, 87]. Units stand in
+    :mod:`agility_rl.keys`.
 
     Args:
         num_robots: N.
@@ -77,6 +79,8 @@ class AgilityEnv(EnvBase):
         push_interval: seconds between pushes; ``None`` for none.
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
         motion_offsets: which discriminator frames ``motion`` holds, in control steps from the oldest.
+        depth: keyword arguments of :class:`agility_rl.envs.depth.DepthObservation`, such as ``{}``; ``None`` for no
+            camera.
         seed: seed of all randomness in the environment.
 
     Raises:
@@ -113,6 +117,7 @@ class AgilityEnv(EnvBase):
         push_interval: float | None = None,
         push_velocity: float = 0.5,
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
+        depth: Mapping[str, Any] | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([num_robots]))
@@ -143,6 +148,9 @@ class AgilityEnv(EnvBase):
         self.pushes = Pushes(num_robots, self.generator, interval, push_velocity)
         ground = partial(self.arena.ground, simulator=self.simulator)
         self.robots = Robots(self.simulator, self.generator, ground)
+        self.depth: DepthObservation | None = None
+        if depth is not None:
+            self.depth = DepthObservation(self.simulator, self.generator, decision_steps, **depth)
         self._robot = self.robots.state(self.robots.action, self.decisions.commands)
         self._step_count = torch.zeros(num_robots, dtype=torch.int64)
         self._make_specs(num_robots)
@@ -170,6 +178,10 @@ class AgilityEnv(EnvBase):
             },
             shape=(n,),
         )
+        if self.depth is not None:
+            self.observation_spec[keys.DEPTH] = Bounded(
+                -0.5, 0.5, (n, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH), dtype=torch.float32
+            )
         parameters = group(behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS)
         decision = Composite({keys.BEHAVIOUR: skill.clone(), keys.PARAMETERS: parameters}, shape=(n,))
         self.full_action_spec = Composite({keys.ACTION: decision}, shape=(n,))
@@ -219,6 +231,8 @@ class AgilityEnv(EnvBase):
         self.decisions.begin(mask)
         self._robot = self.robots.begin(mask, self.decisions.commands)
         self.observations.reset(mask, self._robot)
+        if self.depth is not None:
+            self.depth.begin(mask)
 
         return self._observe(self._outcome()).exclude("reward")
 
@@ -250,6 +264,8 @@ class AgilityEnv(EnvBase):
         self.observations.update(self._robot)
         self.robots.remember(self._robot)
         self.decisions.advance()
+        if self.depth is not None:
+            self.depth.advance()
 
     def _judge(self, outcome: DecisionOutcome, state: AgilityState, kind: Tensor, events: Events) -> None:
         causes = {name: failed(state) for name, failed in self.terminations.items()}
@@ -294,12 +310,15 @@ class AgilityEnv(EnvBase):
     def _observe(self, outcome: DecisionOutcome) -> TensorDict:
         observation = self.observations.build(self._robot, self.decisions.commands, self.robots.privileged)
         observation.update(self.arena.observe(self.simulator, self._robot.yaw))
+        if self.depth is not None:
+            observation[keys.DEPTH] = self.depth.image()
         return observation.update(outcome.entries(self.arena.progress.detour))
 
     # -- resume ------------------------------------------------------------------------------------------------------
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:  # type: ignore[override]
         """Everything that an exact continuation needs: simulator, course, decisions, memories, clocks, generator."""
         return {
+            **({} if self.depth is None else {"depth": self.depth.state_dict()}),
             "simulator": self.simulator.state_dict(),
             "arena": self.arena.state_dict(),
             "decisions": self.decisions.state_dict(),
@@ -315,6 +334,8 @@ class AgilityEnv(EnvBase):
         self.simulator.load_state_dict(state_dict["simulator"])
         for name in ("arena", "decisions", "observations", "robots"):
             getattr(self, name).load_state_dict(state_dict[name])
+        if self.depth is not None:
+            self.depth.load_state_dict(state_dict["depth"])
         self._step_count = state_dict["step_count"].clone()
         self.pushes.phase = state_dict["push_phase"].clone()
         self.generator.set_state(state_dict["generator"])

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from agility_rl.losses.adaptation import AdaptationLoss, StateEstimationLoss
+from agility_rl.losses.byol import BYOLLoss
 from agility_rl.losses.discriminator import DiscriminatorLoss
 from agility_rl.losses.hybrid_ppo import HybridPPOLoss
 from agility_rl.losses.predictor import PredictorLoss
+from agility_rl.losses.student import StudentLoss
 from agility_rl.losses.transition_discriminator import TransitionDiscriminatorLoss
 
 __all__ = [
     "AdaptationLoss",
+    "BYOLLoss",
     "DiscriminatorLoss",
     "HybridPPOLoss",
     "PredictorLoss",
     "StateEstimationLoss",
+    "StudentLoss",
     "TransitionDiscriminatorLoss",
 ]

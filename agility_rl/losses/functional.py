@@ -308,3 +308,24 @@ def linear_ramp(step: float, start: float, length: float, final: float = 1.0) ->
     if length == 0:
         return final if step >= start else 0.0
     return final * min(max((step - start) / length, 0.0), 1.0)
+
+
+def cosine_regression(prediction: Tensor, target: Tensor) -> Tensor:
+    r"""Squared distance of two vectors on the unit sphere.
+
+    .. math:: \left\| \frac{q}{\|q\|} - \frac{z}{\|z\|} \right\|^2 = 2 - 2 \cos(q, z)
+
+    Source: Grill et al. 2020, arXiv:2006.07733, Eq. (2); method notes, section 5.10.
+
+    Args:
+        prediction: ``[*B, P]``.
+        target: ``[*B, P]``.
+
+    Returns:
+        ``[*B]``, 0 for one direction, 4 for opposite ones.
+
+    Example:
+        >>> cosine_regression(torch.tensor([[2.0, 0.0]]), torch.tensor([[0.0, 5.0]]))
+        tensor([2.])
+    """
+    return 2.0 - 2.0 * functional.cosine_similarity(prediction, target, dim=-1)

@@ -1,6 +1,7 @@
 """Physics of many robots at once, behind one protocol."""
 
 from agility_rl.simulation.batch import BatchSimulator
+from agility_rl.simulation.depth_camera import DepthCamera
 from agility_rl.simulation.scenery import Hinge, Piece, Shape
 from agility_rl.simulation.simulator import PARAMETERS, Simulator, make_simulator
 from agility_rl.simulation.terrain import HeightField, rough_pyramids
@@ -8,6 +9,7 @@ from agility_rl.simulation.terrain import HeightField, rough_pyramids
 __all__ = [
     "PARAMETERS",
     "BatchSimulator",
+    "DepthCamera",
     "HeightField",
     "Hinge",
     "Piece",

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from agility_rl.go2 import constants
 from agility_rl.go2.model import ROBOT_GROUP, build_spec
+from agility_rl.simulation.depth_camera import DepthCamera
 from agility_rl.simulation.scenery import Piece, add_scenery, hinge_name
 from agility_rl.simulation.simulator import PARAMETERS
 from agility_rl.simulation.terrain import HeightField
@@ -91,6 +92,7 @@ class BatchSimulator:
         self.scenery: Sequence[Piece] = tuple(scenery)
         spec = build_spec(sim_dt=sim_dt, **model_options)
         add_scenery(spec, self.scenery)
+        self._spec = spec
         self.model: mujoco.MjModel = spec.compile()
         self.batch = Batch(self.model, num_simulations, self.num_threads)
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
@@ -329,6 +331,10 @@ class BatchSimulator:
         )[:2]
         found = torch.from_numpy(np.array(distance, dtype=np.float32))
         return torch.where(found < 0, torch.inf, found)
+
+    def make_camera(self) -> DepthCamera:
+        """A depth camera on every robot, which follows these simulations."""
+        return DepthCamera(self._spec, self.batch, self.num_threads)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything an exact continuation needs: integration states, parameters, derived fields last read."""

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
+from agility_rl.simulation.depth_camera import DepthCamera
 from agility_rl.simulation.scenery import Piece
 
 PARAMETERS: dict[str, tuple[int, str]] = {
@@ -104,6 +105,10 @@ class Simulator(Protocol):
 
     def ray(self, origin: Tensor, direction: Tensor) -> Tensor:
         """Distance [m] to the nearest surface that is not the robot, ``[N, R]``; infinite when there is none."""
+        ...
+
+    def make_camera(self) -> DepthCamera:
+        """A depth camera on every robot, which follows these simulations."""
         ...
 
     def state_dict(self) -> dict[str, Any]:

@@ -38,3 +38,9 @@ def test_plain_loop_and_recipe_run_in_turns(repository: Path) -> None:
 def test_easi_collection_prints_a_share_of_the_bare_engine(repository: Path) -> None:
     output = run(repository, "benchmarks/easi_collection.py", "--robots=4", "--threads=1", "--rounds=1", "--steps=5")
     assert "EASICollector" in output and output.count("% of bare") == 2
+
+
+@pytest.mark.slow
+def test_depth_prints_its_rate_beside_bare_rays(repository: Path) -> None:
+    output = run(repository, "benchmarks/depth.py", "--robots=2", "--threads=1", "--rounds=1")
+    assert "bare mj_multiRay" in output and output.count("x bare") == 3

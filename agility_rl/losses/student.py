@@ -1,0 +1,202 @@
+"""The student's loss: do as the teacher does, and know what it knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, dispatch
+from torch import Tensor
+from torch.nn import functional
+
+from agility_rl.keys import (
+    BEHAVIOUR,
+    HEADING_ERROR,
+    HEADING_ESTIMATE,
+    LABEL,
+    OBSTACLE,
+    OBSTACLE_LOGITS,
+    PARAMETERS,
+)
+from agility_rl.losses.keyed import KeyedLoss
+
+
+class StudentLoss(KeyedLoss):
+    r"""Imitate a teacher's hybrid action, and predict the heading errors and the type of the obstacle.
+
+    .. math:: L = w_D \, \mathrm{CE}(\ell, a^D_T) + w_C \, E \| a^C_T - \mu \|_2
+              + w_\psi \, E \| \mathrm{diag}(2, \tfrac12) (\Delta\psi - \widehat{\Delta\psi}) \|_2
+              + w_o \, \mathrm{CE}(\ell_o, o)
+
+    All coefficients are already applied to the losses returned. For a recurrent student give the policy that unrolls
+    sequences, ``student.policy(assisted=True, sequence=True)``.
+
+    Source: Eq. (15); form, norms and weights of the headings: released code (method notes, section 5.9). Different:
+    cross-entropy of the obstacle on logits, not on probabilities; differences of headings are wrapped to (-pi, pi].
+
+    Keys read:
+        every entry of ``network.in_keys``
+        (label, behaviour)   int64 ``[*B]``           the teacher's choice
+        (label, parameters)  float32 ``[*B, K, P]``   its parameters, of all choices
+        heading_error        float32 ``[*B, 2]`` [rad]
+        obstacle             float32 ``[*B, O]``, one-hot
+    Keys written (``[]`` each; losses ``[*B]`` with ``reduction="none"``):
+        loss_behaviour, loss_parameters, loss_heading, loss_obstacle  only those with a coefficient
+        accuracy_behaviour, accuracy_obstacle  share that agrees, detached
+        error_heading                          mean absolute error to the current way-point [rad], detached
+
+    Args:
+        network: writes logits ``[*B, K]``, mean parameters ``[*B, K, P]``, heading estimates ``[*B, 2]`` and obstacle
+            logits ``[*B, O]``.
+        behaviour: coefficient of the choice; schedulable. ``None`` leaves a term out.
+        continuous: coefficient of the parameters; schedulable.
+        heading: coefficient of the headings; schedulable.
+        obstacle: coefficient of the obstacle; schedulable.
+        compared: parameters of ``"all"`` choices, as released, or of the one that the teacher ``"selected"``.
+        heading_weights: of the errors to the current and the next way-point.
+        reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
+
+    Raises:
+        ValueError: if no coefficient is given, or ``compared`` is something else.
+
+    Example:
+        >>> student = TensorDictModule(
+        ...     lambda x: (x[..., :2], x[..., :4].unflatten(-1, (2, 2)), x[..., :2], x[..., :3]),
+        ...     in_keys=["x"], out_keys=["logits", "loc", "heading_estimate", "obstacle_logits"])
+        >>> label = {"behaviour": torch.zeros(5, dtype=torch.long), "parameters": torch.zeros(5, 2, 2)}
+        >>> losses = StudentLoss(student)(TensorDict({"x": torch.ones(5, 4), "label": label,
+        ...     "heading_error": torch.zeros(5, 2), "obstacle": torch.eye(3)[[0, 1, 2, 0, 1]]}, [5]))
+        >>> round(losses["loss_behaviour"].item(), 4), losses["loss_parameters"].item()
+        (0.6931, 2.0)
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys of the loss, changed by ``set_keys``.
+
+        Attributes:
+            logits (NestedKey): what the network writes, ``[*B, K]``.
+            loc (NestedKey): what the network writes, ``[*B, K, P]``.
+            heading_estimate (NestedKey): what the network writes, ``[*B, 2]``.
+            obstacle_logits (NestedKey): what the network writes, ``[*B, O]``.
+            behaviour (NestedKey): the teacher's choice.
+            parameters (NestedKey): the teacher's parameters.
+            heading_error (NestedKey): true heading errors.
+            obstacle (NestedKey): true obstacle, one-hot.
+        """
+
+        logits: NestedKey = "logits"
+        loc: NestedKey = "loc"
+        heading_estimate: NestedKey = HEADING_ESTIMATE
+        obstacle_logits: NestedKey = OBSTACLE_LOGITS
+        behaviour: NestedKey = (LABEL, BEHAVIOUR)
+        parameters: NestedKey = (LABEL, PARAMETERS)
+        heading_error: NestedKey = HEADING_ERROR
+        obstacle: NestedKey = OBSTACLE
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    network: TensorDictModule
+    network_params: TensorDictParams
+    target_network_params: TensorDictParams
+    _schedulable_buffers = frozenset({"behaviour", "continuous", "heading", "obstacle"})
+
+    def __init__(
+        self,
+        network: TensorDictModule,
+        *,
+        behaviour: float | None = 1.0,
+        continuous: float | None = 1.0,
+        heading: float | None = 1.0,
+        obstacle: float | None = 1.0,
+        compared: Literal["all", "selected"] = "all",
+        heading_weights: tuple[float, float] = (2.0, 0.5),
+        reduction: str | None = None,
+    ) -> None:
+        super().__init__()
+        coefficients = {"behaviour": behaviour, "continuous": continuous, "heading": heading, "obstacle": obstacle}
+        if all(value is None for value in coefficients.values()):
+            raise ValueError(f"at least one of {', '.join(coefficients)} must be a number, got none")
+        if compared not in ("all", "selected"):
+            raise ValueError(f"compared must be 'all' or 'selected', got {compared!r}")
+        self.compared = compared
+        self.reduction = "mean" if reduction is None else reduction
+        self.convert_to_functional(network, "network")
+        for name, value in coefficients.items():
+            if value is None:
+                setattr(self, name, None)
+            else:
+                self.register_coeff_buffer(name, value)
+        self.register_buffer("heading_weights", torch.tensor(heading_weights))
+        self._set_in_keys()
+
+    def _set_in_keys(self) -> None:
+        keys, targets = self.tensor_keys, []
+        if self.behaviour is not None or (self.continuous is not None and self.compared == "selected"):
+            targets.append(keys.behaviour)
+        for coefficient, key in (
+            (self.continuous, keys.parameters),
+            (self.heading, keys.heading_error),
+            (self.obstacle, keys.obstacle),
+        ):
+            if coefficient is not None:
+                targets.append(key)
+        read = list(self.network.in_keys)
+        self._in_keys = [*read, *(key for key in targets if key not in read)]
+
+    @property
+    def out_keys(self) -> list[str]:
+        """Entries written."""
+        names: list[str] = []
+        if self.behaviour is not None:
+            names += ["loss_behaviour", "accuracy_behaviour"]
+        if self.continuous is not None:
+            names += ["loss_parameters"]
+        if self.heading is not None:
+            names += ["loss_heading", "error_heading"]
+        if self.obstacle is not None:
+            names += ["loss_obstacle", "accuracy_obstacle"]
+        return names
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the losses; the input stays as it is."""
+        keys, out = self.tensor_keys, TensorDict()
+        with self.network_params.to_module(self.network, preserve_module_state=False):
+            written = self.network(tensordict.select(*self.network.in_keys))
+        if self.behaviour is not None:
+            logits, choice = written.get(keys.logits), tensordict.get(keys.behaviour)
+            error = _cross_entropy(logits, choice)
+            out.set("loss_behaviour", self.behaviour * self._reduce_loss(error, tensordict))
+            out.set("accuracy_behaviour", (logits.detach().argmax(-1) == choice).float().mean())
+        if self.continuous is not None:
+            difference = tensordict.get(keys.parameters).detach() - written.get(keys.loc)  # [*B, K, P]
+            if self.compared == "selected":
+                chosen = tensordict.get(keys.behaviour)
+                difference = difference.take_along_dim(chosen[..., None, None], -2)
+            error = torch.linalg.vector_norm(difference.flatten(-2), dim=-1)
+            out.set("loss_parameters", self.continuous * self._reduce_loss(error, tensordict))
+        if self.heading is not None:
+            difference = _wrap(tensordict.get(keys.heading_error).detach() - written.get(keys.heading_estimate))
+            error = torch.linalg.vector_norm(self.heading_weights * difference, dim=-1)
+            out.set("loss_heading", self.heading * self._reduce_loss(error, tensordict))
+            out.set("error_heading", difference.detach()[..., 0].abs().mean())
+        if self.obstacle is not None:
+            logits, kind = written.get(keys.obstacle_logits), tensordict.get(keys.obstacle).argmax(-1)
+            error = _cross_entropy(logits, kind)
+            out.set("loss_obstacle", self.obstacle * self._reduce_loss(error, tensordict))
+            out.set("accuracy_obstacle", (logits.detach().argmax(-1) == kind).float().mean())
+        self._clear_weakrefs(tensordict, out, "network_params", "target_network_params")
+        return out
+
+
+def _cross_entropy(logits: Tensor, index: Tensor) -> Tensor:
+    """``[*B, K]`` and ``[*B]`` to ``[*B]``."""
+    return functional.cross_entropy(logits.flatten(0, -2), index.flatten(), reduction="none").reshape(index.shape)
+
+
+def _wrap(angle: Tensor) -> Tensor:
+    """To (-pi, pi], with a gradient of 1 everywhere."""
+    return angle - 2.0 * torch.pi * torch.ceil((angle.detach() - torch.pi) / (2.0 * torch.pi))

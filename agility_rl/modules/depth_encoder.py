@@ -1,0 +1,91 @@
+"""The encoder of depth images: two convolutions, one max-pool, two linear layers."""
+
+from __future__ import annotations
+
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from agility_rl.go2.camera import IMAGE_HEIGHT, IMAGE_WIDTH, dequantize
+from agility_rl.keys import DEPTH, DEPTH_FEATURE
+
+
+class DepthEncoder(TensorDictModule):
+    """Encode depth images into features, each image by itself.
+
+    Source: kernels {5, 3}, max-pool of size and stride 2, two linear layers, 32 features: supplement, section S6; 32
+    and 64 channels, 128 hidden units, ELU, linear output: released code (method notes, section 5.9).
+
+    Keys read:
+        depth          float32 ``[*B, 58, 87]`` in [-0.5, 0.5], or stored as uint8 or int16
+    Keys written:
+        depth_feature  float32 ``[*B, F]``, F = ``out_features``
+
+    Args:
+        out_features: F.
+        height: rows of an image.
+        width: columns of an image.
+        channels: of the two convolutions.
+        hidden: size of the hidden linear layer.
+        in_key: key of the images.
+        out_key: key of the features.
+
+    Raises:
+        ValueError: if images are too small for the kernels, or have another size, or swapped axes (at the call).
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> td = TensorDict({"depth": torch.zeros(4, 58, 87)}, batch_size=[4])
+        >>> DepthEncoder()(td)["depth_feature"].shape
+        torch.Size([4, 32])
+    """
+
+    def __init__(
+        self,
+        out_features: int = 32,
+        *,
+        height: int = IMAGE_HEIGHT,
+        width: int = IMAGE_WIDTH,
+        channels: tuple[int, int] = (32, 64),
+        hidden: int = 128,
+        in_key: NestedKey = DEPTH,
+        out_key: NestedKey = DEPTH_FEATURE,
+    ) -> None:
+        network = DepthNetwork(height, width, channels, hidden, out_features)
+        super().__init__(network, in_keys=[in_key], out_keys=[out_key])
+
+
+class DepthNetwork(nn.Module):
+    """The layers of :class:`DepthEncoder`, tensor in, tensor out.
+
+    Example:
+        >>> import torch
+        >>> DepthNetwork(58, 87, (32, 64), 128, 32)(torch.zeros(2, 3, 58, 87)).shape
+        torch.Size([2, 3, 32])
+    """
+
+    def __init__(self, height: int, width: int, channels: tuple[int, int], hidden: int, out_features: int) -> None:
+        super().__init__()
+        rows, columns = (height - 4) // 2 - 2, (width - 4) // 2 - 2  # kernel 5, pool 2, kernel 3
+        if min(rows, columns) < 1:
+            raise ValueError(f"images must have at least 10 rows and columns for kernels (5, 3), got {height}, {width}")
+        self.height, self.width = height, width
+        self.convolutions = nn.Sequential(
+            *(nn.Conv2d(1, channels[0], 5), nn.MaxPool2d(2, 2), nn.ELU()),
+            *(nn.Conv2d(channels[0], channels[1], 3), nn.ELU()),
+        )
+        self.linear = nn.Sequential(
+            *(nn.Flatten(), nn.Linear(channels[1] * rows * columns, hidden), nn.ELU(), nn.Linear(hidden, out_features)),
+        )
+
+    def forward(self, depth: Tensor) -> Tensor:
+        """Map images ``[*B, H, W]`` to features ``[*B, F]``."""
+        size = tuple(depth.shape[-2:])
+        if size != (self.height, self.width):
+            advice = ": rows and columns are swapped" if size == (self.width, self.height) else ""
+            raise ValueError(
+                f"depth images must be [*B, {self.height} rows, {self.width} columns], got {list(depth.shape)}{advice}"
+            )
+        images = dequantize(depth).reshape(-1, 1, self.height, self.width)  # [N, channels, H, W]
+        return self.linear(self.convolutions(images)).reshape(*depth.shape[:-2], -1)

@@ -1,0 +1,218 @@
+"""The Task-Specific Controller's student: from depth images and memory to what the teacher knows, and its actions."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+
+from agility_rl import keys
+from agility_rl.go2 import features
+from agility_rl.modules.adaptation import HistoryEncoder
+from agility_rl.modules.behaviour_controller import NUM_LATENT
+from agility_rl.modules.depth_encoder import DepthEncoder
+from agility_rl.modules.estimator import StateEstimator
+from agility_rl.modules.hybrid_actor import HybridActor
+from agility_rl.modules.mlp import mlp
+from agility_rl.modules.teacher import NUM_HEADING, Teacher
+
+NUM_TERRAIN_LATENT = 32
+"""Size of the teacher's encoding of the scandots, which the student imitates (supplement, section S6)."""
+HEADING_SCALE = 1.5
+"""Factor on the predicted heading errors (method notes, section 5.9)."""
+HEADING_GATE = 0.6
+"""Heading errors beyond this are given, not predicted, while the student is trained [rad] (section 5.9)."""
+
+PERCEIVED_HEADING: NestedKey = ("perceived", keys.HEADING_ERROR)
+PERCEIVED_OBSTACLE: NestedKey = ("perceived", keys.OBSTACLE)
+NEXT_HIDDEN: NestedKey = ("memory", keys.HIDDEN)
+"""What the student writes for itself: heading and obstacle as its actor reads them, and the memory of the next step."""
+
+
+class RecurrentStudent(nn.Module):
+    """A behaviour and its parameters from depth images and what the robot measures.
+
+    The feature of the present image and the proprioception are fused and remembered by a GRU, which infers the
+    teacher's terrain latent, the heading errors and the type of obstacle. The actor, the estimator and the history
+    encoder are the teacher's (:meth:`from_teacher`).
+
+    Source: kernels, GRU of 512 units, actor {512, 256, 128}: supplement, section S6; fusion 128 and 32, heads, factor
+    1.5, gate 0.6: released code (method notes, section 5.9). Ours: the terrain latent passes tanh, as the teacher's
+    does; the actor's gradient does not pass the predicted heading; the memory is reset with the episode (the release
+    carries it on).
+
+    Keys read: ``depth`` [*B, 58, 87], ``proprioception`` [*B, 45], ``history`` [*B, 10, 45], ``hidden`` [*B, 512],
+    ``is_init`` bool [*B, 1], true in the first step of an episode; with assistance ``heading_error`` [*B, 2] too.
+    Keys written: ``depth_feature`` [*B, 32], ``terrain_latent`` [*B, 32], ``heading_estimate`` [*B, 2],
+    ``obstacle_logits`` [*B, 7], ``(memory, hidden)`` [*B, 512], ``(perceived, heading_error)``,
+    ``(perceived, obstacle)``, ``estimate``, ``latent`` and those of :class:`~agility_rl.modules.HybridActor`.
+
+    Args:
+        num_obstacles: types of obstacles.
+        hidden: sizes of the actor's hidden layers.
+        initial_std: standard deviation of the parameters at the start.
+        min_std: its floor.
+        allowed: indices of the behaviours that it may choose; ``None`` for all.
+        memory: units of the GRU.
+        heading_gate: see :data:`HEADING_GATE`.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> student = RecurrentStudent(memory=16)
+        >>> td = TensorDict({"depth": torch.zeros(3, 58, 87), "proprioception": torch.zeros(3, 45),
+        ...     "history": torch.zeros(3, 10, 45), "hidden": student.initial_hidden(3),
+        ...     "is_init": torch.ones(3, 1, dtype=torch.bool)}, [3])
+        >>> student.policy()(td)["action", "parameters"].shape
+        torch.Size([3, 5, 6])
+    """
+
+    def __init__(
+        self,
+        num_obstacles: int = 7,
+        hidden: Sequence[int] = (512, 256, 128),
+        initial_std: float = 1.0,
+        min_std: float = 0.1,
+        allowed: Sequence[int] | None = None,
+        *,
+        memory: int = 512,
+        heading_gate: float = HEADING_GATE,
+    ) -> None:
+        super().__init__()
+        self.settings: dict[str, Any] = {
+            "num_obstacles": num_obstacles,
+            "hidden": list(hidden),
+            "initial_std": initial_std,
+            "min_std": min_std,
+            "allowed": None if allowed is None else list(allowed),
+            "memory": memory,
+            "heading_gate": heading_gate,
+        }
+        self.depth_encoder = DepthEncoder()
+        self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
+        self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
+        self.memory = Memory(32 + features.NUM_PROPRIOCEPTION, memory, num_obstacles)
+        self.heading_gate = heading_gate
+        inputs: dict[NestedKey, int] = {
+            keys.PROPRIOCEPTION: features.NUM_PROPRIOCEPTION,
+            PERCEIVED_HEADING: NUM_HEADING,
+            PERCEIVED_OBSTACLE: num_obstacles,
+            keys.TERRAIN_LATENT: NUM_TERRAIN_LATENT,
+            keys.ESTIMATE: features.NUM_EXPLICIT,
+            keys.LATENT: NUM_LATENT,
+        }
+        self.actor = HybridActor(
+            sum(inputs.values()),
+            in_keys=list(inputs),
+            hidden=hidden,
+            initial_std=initial_std,
+            min_std=min_std,
+            allowed=allowed,
+        )
+
+    @classmethod
+    def from_teacher(cls, teacher: Teacher, **options: Any) -> RecurrentStudent:
+        """A student with a teacher's sizes and copies of its actor, estimator and history encoder."""
+        student = cls(**teacher.settings, **options)
+        for name in ("actor", "estimator", "history_encoder"):
+            getattr(student, name).load_state_dict(getattr(teacher, name).state_dict())
+        return student
+
+    def initial_hidden(self, num_robots: int) -> Tensor:
+        """Memory of robots that have not seen anything, ``[N, 512]``."""
+        return torch.zeros(num_robots, self.memory.hidden_size, device=next(self.parameters()).device)
+
+    def policy(self, *, assisted: bool = False, sequence: bool = False) -> TensorDictSequential:
+        """The policy, sharing this student's parameters.
+
+        Args:
+            assisted: take heading errors beyond the gate from ``heading_error``, as in training.
+            sequence: for batches ``[T, *B]`` of consecutive steps, time first, instead of one step ``[*B]``; of
+                ``hidden`` only the first step's counts.
+        """
+        remember = self.memory if sequence else _OneStep(self.memory)
+        perceive = _Perception(self.heading_gate if assisted else None)
+        return TensorDictSequential(
+            self.depth_encoder,
+            TensorDictModule(
+                remember,
+                in_keys=[keys.DEPTH_FEATURE, keys.PROPRIOCEPTION, keys.HIDDEN, "is_init"],
+                out_keys=[keys.TERRAIN_LATENT, keys.HEADING_ESTIMATE, keys.OBSTACLE_LOGITS, NEXT_HIDDEN],
+            ),
+            TensorDictModule(
+                perceive,
+                in_keys=[keys.HEADING_ESTIMATE, keys.OBSTACLE_LOGITS, *([keys.HEADING_ERROR] if assisted else [])],
+                out_keys=[PERCEIVED_HEADING, PERCEIVED_OBSTACLE],
+            ),
+            self.estimator,
+            self.history_encoder,
+            self.actor,
+        )
+
+
+class Memory(nn.Module):
+    """Fuse feature and proprioception, remember, and infer the terrain latent, the heading errors and the obstacle.
+
+    Example:
+        >>> memory = Memory(77, 16, 7)
+        >>> first = torch.zeros(5, 3, 1, dtype=torch.bool)
+        >>> outputs = memory(torch.zeros(5, 3, 32), torch.zeros(5, 3, 45), torch.zeros(5, 3, 16), first)
+        >>> [tuple(output.shape) for output in outputs]
+        [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 16)]
+    """
+
+    def __init__(self, in_features: int, hidden_size: int, num_obstacles: int) -> None:
+        super().__init__()
+        self.hidden_size = hidden_size
+        self.fusion = mlp(in_features, (128,), 32)
+        self.cell = nn.GRU(32, hidden_size)
+        self.sizes = (NUM_TERRAIN_LATENT, NUM_HEADING, num_obstacles)
+        self.head = mlp(hidden_size, (), sum(self.sizes))
+
+    def forward(
+        self, feature: Tensor, proprioception: Tensor, hidden: Tensor, is_init: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Steps of ``[T, *B]``: terrain latent, heading errors [rad], obstacle logits, memory after each step."""
+        time, batch = feature.shape[0], feature.shape[1:-1]
+        fused = self.fusion(torch.cat((feature, proprioception), -1)).reshape(time, -1, 32)
+        first = is_init.reshape(time, -1, 1)
+        state = hidden[0].reshape(1, -1, self.hidden_size)
+        # One call of the GRU from each step in which somebody begins an episode to the next.
+        edges = sorted({0, time, *first.flatten(1).any(1).nonzero()[:, 0].tolist()})
+        pieces = []
+        for start, end in itertools.pairwise(edges):
+            state = state.masked_fill(first[start][None], 0.0)
+            piece, state = self.cell(fused[start:end], state)
+            pieces.append(piece)
+        remembered = torch.cat(pieces).reshape(time, *batch, self.hidden_size)
+        latent, heading, logits = self.head(remembered).split(self.sizes, -1)
+        return latent.tanh(), HEADING_SCALE * heading, logits, remembered
+
+
+class _OneStep(nn.Module):
+    """:class:`Memory` for one step of ``[*B]``."""
+
+    def __init__(self, memory: Memory) -> None:
+        super().__init__()
+        self.memory = memory
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        return tuple(output[0] for output in self.memory(*(value[None] for value in inputs)))
+
+
+class _Perception(nn.Module):
+    """What the actor reads: predicted heading errors, true ones beyond the gate, and the likeliest obstacle."""
+
+    def __init__(self, gate: float | None) -> None:
+        super().__init__()
+        self.gate = gate
+
+    def forward(self, estimate: Tensor, logits: Tensor, truth: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        heading = estimate.detach()
+        if truth is not None and self.gate is not None:
+            heading = torch.where(truth.abs() < self.gate, heading, truth)
+        return heading, nn.functional.one_hot(logits.argmax(-1), logits.shape[-1]).to(logits.dtype)

@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import InteractionType, set_interaction_type
+from torch import nn
+
+from agility_rl.modules import RecurrentStudent, Teacher
+
+M = 16
+"""Units of memory in the tests."""
+
+
+@pytest.fixture
+def student() -> RecurrentStudent:
+    return RecurrentStudent(memory=M)
+
+
+def steps(time: int, robots: int) -> TensorDict:
+    return TensorDict(
+        {
+            "depth": torch.rand(time, robots, 58, 87) - 0.5,
+            "proprioception": torch.randn(time, robots, 45),
+            "history": torch.randn(time, robots, 10, 45),
+            "heading_error": torch.rand(time, robots, 2) * 2.0 - 1.0,
+            "hidden": torch.randn(robots, M).expand(time, robots, M),
+            "is_init": torch.zeros(time, robots, 1, dtype=torch.bool),
+        },
+        [time, robots],
+    )
+
+
+def one_by_one(student: RecurrentStudent, td: TensorDict) -> TensorDict:
+    policy, hidden, rows = student.policy(assisted=True), td["hidden"][0], []
+    with set_interaction_type(InteractionType.DETERMINISTIC):
+        for step in td.unbind(0):
+            rows.append(policy(step.clone().set("hidden", hidden)))
+            hidden = rows[-1]["memory", "hidden"]
+    return torch.stack(rows)
+
+
+def test_sizes_are_those_of_the_supplement() -> None:
+    student = RecurrentStudent()
+    assert student.memory.cell.hidden_size == 512
+    assert [p.shape[0] for p in student.memory.fusion.parameters() if p.dim() == 2] == [128, 32]
+    assert student.memory.fusion[0].in_features == 32 + 45
+    assert student.memory.head[0].out_features == 32 + 2 + 7
+
+
+def test_shapes_and_keys(student: RecurrentStudent) -> None:
+    td = student.policy()(steps(1, 3)[0].exclude("heading_error"))
+    shapes = {
+        "depth_feature": (32,),
+        "terrain_latent": (32,),
+        "heading_estimate": (2,),
+        "obstacle_logits": (7,),
+        ("memory", "hidden"): (M,),
+        ("action", "parameters"): (5, 6),
+        "logits": (5,),
+    }
+    for key, shape in shapes.items():
+        assert td[key].shape == (3, *shape), key
+
+
+def test_a_window_unrolled_is_what_single_steps_give_with_beginnings_anywhere(student: RecurrentStudent) -> None:
+    td = steps(6, 4)
+    td["is_init"][3, 1] = td["is_init"][3, 2] = td["is_init"][5, 1] = td["is_init"][0, 0] = True
+    expected = one_by_one(student, td)
+    with set_interaction_type(InteractionType.DETERMINISTIC):
+        unrolled = student.policy(assisted=True, sequence=True)(td.clone())
+    for key in (("memory", "hidden"), "terrain_latent", "heading_estimate", "obstacle_logits", "logits", "loc"):
+        torch.testing.assert_close(unrolled[key], expected[key], rtol=1e-4, atol=1e-5)
+
+
+def test_an_episode_does_not_remember_the_one_before_it(student: RecurrentStudent) -> None:
+    td = steps(4, 2)
+    td["is_init"][2, 0] = True
+    other = td.clone()
+    other["depth"][:2] = torch.rand(2, 2, 58, 87) - 0.5
+    one, two = (student.policy(sequence=True)(x)["memory", "hidden"] for x in (td.clone(), other))
+    torch.testing.assert_close(one[2:, 0], two[2:, 0])
+    assert not torch.allclose(one[2:, 1], two[2:, 1], atol=1e-6)
+    assert not torch.allclose(one[:2], two[:2], atol=1e-6)
+
+
+def test_a_new_episode_begins_with_the_initial_memory(student: RecurrentStudent) -> None:
+    td = steps(1, 3)[0]
+    fresh = td.clone().set("hidden", student.initial_hidden(3))
+    td["is_init"] = torch.ones(3, 1, dtype=torch.bool)
+    policy = student.policy()
+    torch.testing.assert_close(policy(td)["memory", "hidden"], policy(fresh)["memory", "hidden"])
+
+
+def test_headings_beyond_the_gate_are_given_in_training_only(student: RecurrentStudent) -> None:
+    td = steps(1, 200)[0]
+    assisted, alone = student.policy(assisted=True)(td.clone()), student.policy()(td.clone())
+    truth, estimate = td["heading_error"], assisted["heading_estimate"]
+    used = assisted["perceived", "heading_error"]
+    far = truth.abs() >= 0.6
+    assert far.any() and (~far).any()
+    assert torch.equal(used[far], truth[far]) and torch.equal(used[~far], estimate[~far])
+    assert torch.equal(alone["perceived", "heading_error"], alone["heading_estimate"])
+    assert "heading_error" not in student.policy().in_keys
+
+
+def test_the_actor_reads_the_likeliest_obstacle(student: RecurrentStudent) -> None:
+    td = student.policy()(steps(1, 50)[0])
+    expected = nn.functional.one_hot(td["obstacle_logits"].argmax(-1), 7).float()
+    assert torch.equal(td["perceived", "obstacle"], expected)
+
+
+def test_factor_on_the_headings(student: RecurrentStudent) -> None:
+    with torch.no_grad():
+        student.memory.head[0].weight.zero_()
+        student.memory.head[0].bias.fill_(0.4)
+    td = student.policy()(steps(1, 2)[0])
+    torch.testing.assert_close(td["heading_estimate"], torch.full((2, 2), 0.6))
+    torch.testing.assert_close(td["terrain_latent"], torch.full((2, 32), 0.4).tanh())
+
+
+def test_from_a_teacher() -> None:
+    teacher = Teacher(hidden=(32, 16), allowed=[1, 2])
+    student = RecurrentStudent.from_teacher(teacher, memory=M)
+    assert student.settings["memory"] == M and student.settings["allowed"] == [1, 2]
+    for name in ("actor", "estimator", "history_encoder"):
+        mine, its = getattr(student, name), getattr(teacher, name)
+        assert all(torch.equal(a, b) for a, b in zip(mine.parameters(), its.parameters(), strict=True))
+        assert not {id(p) for p in mine.parameters()} & {id(p) for p in its.parameters()}
+    # Knowing what the teacher knows, its actor does what the teacher's does.
+    td = steps(1, 3)[0].update({"obstacle": torch.eye(7)[:3], "scandots": torch.randn(3, 132)})
+    with set_interaction_type(InteractionType.DETERMINISTIC):
+        expected = teacher.deployable_policy()(td.clone())
+        known = td.update({"perceived": {"heading_error": td["heading_error"], "obstacle": td["obstacle"]}})
+        known.update(expected.select("terrain_latent", "estimate", "latent"))
+        torch.testing.assert_close(student.actor(known)["loc"], expected["loc"])
+
+
+def test_gradients(student: RecurrentStudent) -> None:
+    td = student.policy(sequence=True)(steps(3, 2))
+    td["loc"].sum().backward(retain_graph=True)
+    head = student.memory.head[0].weight.grad
+    assert head[:32].abs().sum() > 0 and head[32:].abs().sum() == 0  # by the latent, not by what it perceives
+    assert all(p.grad.abs().sum() > 0 for p in student.depth_encoder.parameters())
+    assert student.memory.cell.weight_hh_l0.grad.abs().sum() > 0
+    (td["heading_estimate"].sum() + td["obstacle_logits"].square().sum()).backward()
+    assert student.memory.head[0].weight.grad[32:].abs().sum() > 0
+
+
+def test_policies_share_the_parameters_and_hold_all_of_them(student: RecurrentStudent) -> None:
+    own = {id(p) for p in student.parameters()}
+    for sequence in (False, True):
+        assert {id(p) for p in student.policy(sequence=sequence).parameters()} == own
+    rebuilt = RecurrentStudent(**student.settings)
+    rebuilt.load_state_dict(student.state_dict())
+    td = steps(1, 2)[0]
+    torch.testing.assert_close(rebuilt.policy()(td.clone())["loc"], student.policy()(td.clone())["loc"])
