@@ -115,6 +115,9 @@ class ImitationConfig:
     not forgotten while the robot learns not to fall."""
     cloning_fade: tuple[int, int] = (0, 500)
     """First iteration and length of its fading away."""
+    anchor: float = 0.0
+    """Weight of staying near the policy of ``--init-from`` (squared distance of the mean actions): PPO then mends falls
+    and leaves good gaits alone, which a discriminator that starts anew would not."""
     warm_up: int = 0
     """Steps in which the predictor learns the labels before anything else, so that its first rewards mean something."""
     information: float = 1.0

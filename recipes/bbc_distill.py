@@ -118,13 +118,15 @@ def mean_action(bbc: BasicBehaviourController, observation: TensorDictBase) -> T
     return bbc.trained_actor()[:-1](inputs)["loc"]
 
 
-def collect(env: LocomotionEnv, carrier: TensorDictBase, act: Act, label: Act, cfg: Config) -> Experience:
+def collect(
+    env: LocomotionEnv, carrier: TensorDictBase, act: Act, label: Act, cfg: Config, generator: torch.Generator
+) -> Experience:
     """Inputs and labels ``[steps * N]`` of a round, and the observation from which the next one goes on."""
     rows = []
     for _ in range(cfg.steps):
         row = carrier.select(*INPUTS).clone()
         row["label"] = label(row)
-        carrier[keys.ACTION] = act(row) + cfg.noise * torch.randn(row["label"].shape)
+        carrier[keys.ACTION] = act(row) + cfg.noise * torch.randn(row["label"].shape, generator=generator)
         rows.append(row)
         _, carrier = env.step_and_maybe_reset(carrier)
     return torch.cat(rows), carrier
@@ -176,7 +178,7 @@ def main(cfg: Config) -> Path:
     for number in range(cfg.rounds):
         act = label if number < cfg.teacher_rounds else partial(mean_action, bbc)
         with torch.no_grad():
-            rows, carrier = collect(env, carrier, act, label, cfg)
+            rows, carrier = collect(env, carrier, act, label, cfg, seeds.generator("noise"))
         found = errors(bbc, rows)
         print(
             f"round {number + 1:2d}: " + "  ".join(f"{name} {value:.3f}" for name, value in found.items()), flush=True

@@ -82,7 +82,7 @@ CPU = Config(
 POLISH = replace(
     CPU,
     name="polish",
-    iterations=240,
+    iterations=90,
     changes=(),
     motion=replace(CPU.motion, one_sided=("canter", "jump")),
     env=replace(CPU.env, progress_weight=4.0, jump_weight=20.0),  # no fading: it walks already
@@ -97,10 +97,12 @@ POLISH = replace(
     imitation=replace(
         CPU.imitation,
         cloning=0,
-        imitation_reward=5.0,
+        anchor=5.0,
+        imitation_reward=2.0,
+        skill_reward=1.0,
         information=0.05,
         information_ramp=(0, 50),
-        prior_weight=5e-3,
+        prior_weight=0.02,
     ),
 )
 QUICKSTART = replace(

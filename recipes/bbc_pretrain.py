@@ -65,7 +65,9 @@ def update_imitation(parts: Components, cfg: ImitationConfig, iteration: int) ->
         parts.imitation_optimizer.zero_grad(set_to_none=True)
         loss.backward()
         parts.imitation_optimizer.step()
-        parts.prior.update(predicted["unlabelled_skill_probability"])
+        recorded = parts.dataset.sample_unlabelled(cfg.batch_size, parts.generator, as_recorded=True)
+        with torch.no_grad():
+            parts.prior.update(parts.predictor(recorded)[keys.SKILL_LOGITS].softmax(-1).mean(0))
         for name, value in (*discriminated.items(), *predicted.items()):
             if value.numel() == 1:
                 totals[name] = totals.get(name, torch.zeros(())) + value.detach() / cfg.minibatches
@@ -138,6 +140,14 @@ def speed_share(parts: Components, batch: TensorDictBase) -> Tensor:
     if term is None or not term.weight:
         return torch.ones_like(batch["next", "reward"])
     return batch["next", keys.REWARD_TERMS, "velocity_progress"] / (term.weight * parts.env.dt)
+
+
+def distance_to_anchor(parts: Components, sample: TensorDictBase) -> Tensor:
+    """Mean squared difference between the mean actions of policy and anchor [action units squared]."""
+    assert parts.anchor is not None
+    now, held = (bbc.trained_actor()[:-1] for bbc in (parts.bbc, parts.anchor))
+    inputs = sample.select(*now.in_keys)
+    return torch.nn.functional.mse_loss(now(inputs.clone(False))["loc"], held(inputs.clone(False))["loc"])
 
 
 def update_adaptation(parts: Components, minibatches: int, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -241,7 +251,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
 
         def extra(sample: TensorDictBase) -> Tensor:
             loss = parts.adaptation_loss(sample)["loss_privileged"] if weight > 0.0 else torch.zeros(())
-            return loss + kept * parts.demonstrations.error(parts.bbc) if kept > 0.0 else loss
+            if kept > 0.0:
+                loss = loss + kept * parts.demonstrations.error(parts.bbc)
+            return loss if parts.anchor is None else loss + cfg.imitation.anchor * distance_to_anchor(parts, sample)
 
         metrics |= parts.ppo(batch, parts.generator, extra, critic_only=iteration < cfg.ppo.critic_warm_up)
     lap("policy")

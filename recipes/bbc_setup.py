@@ -58,6 +58,7 @@ class Components:
     demonstrations: Demonstrations
     env: LocomotionEnv
     bbc: BasicBehaviourController
+    anchor: BasicBehaviourController | None
     critic: Critic
     discriminator: Discriminator
     predictor: Predictor
@@ -122,6 +123,12 @@ def build(cfg: Config) -> Components:
         seed=seeds.integer("environment"),
     )
     bbc = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std)
+    anchor = None
+    if im.anchor:
+        if cfg.init_from is None:
+            raise ValueError("--imitation.anchor holds on to the policy of --init-from RUN; give both or neither")
+        anchor = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std).requires_grad_(False)
+        anchor.load_state_dict(Artifact.load(policy_folder(cfg.init_from), kind="bbc").state)
     critic_keys = [keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.COMMAND, keys.PEAK]
     critic_keys += [keys.HISTORY] if ppo.critic_history else []
     width = sum(env.observation_spec[key].shape[1:].numel() for key in critic_keys)
@@ -191,6 +198,7 @@ def build(cfg: Config) -> Components:
         ),
         env=env,
         bbc=bbc,
+        anchor=anchor,
         critic=critic,
         discriminator=discriminator,
         predictor=predictor,

@@ -139,18 +139,20 @@ class MotionDataset:
         if labelled:
             self._states["root_height"] = torch.cat([clip.root_position[:, 2:] for clip in labelled])
 
-    def sample_unlabelled(self, n: int, generator: torch.Generator | None) -> TensorDict:
+    def sample_unlabelled(self, n: int, generator: torch.Generator | None, *, as_recorded: bool = False) -> TensorDict:
         """``n`` samples of unlabelled motion.
 
         Args:
             n: number of samples.
             generator: source of randomness.
+            as_recorded: draw every start alike, whatever the weights of clips and standing: what the shares of
+                behaviours in the recordings are, a skill prior should not learn from a choice of them.
 
         Returns:
             ``motion`` float32 ``[n, H, F]``.
         """
         pool = self._unlabelled
-        if self._uniform:
+        if self._uniform or as_recorded:
             pick = torch.randint(len(pool.starts), (n,), generator=generator)
         else:
             pick = _draw(self._unlabelled_table, torch.zeros(n, dtype=torch.int64), generator)

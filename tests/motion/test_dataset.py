@@ -77,6 +77,8 @@ def test_unlabelled_weights_count(clips: dict[str, MotionClip], generator: torch
     dataset = MotionDataset([], [clips["free"], heavy], features=tag_and_frame)
     tags = dataset.sample_unlabelled(20000, generator)["motion"][:, 0, 0]
     assert (tags == 5).float().mean() == pytest.approx(0.5, abs=0.02)
+    tags = dataset.sample_unlabelled(20000, generator, as_recorded=True)["motion"][:, 0, 0]
+    assert (tags == 5).float().mean() == pytest.approx(2 / 102, abs=0.005)
 
 
 def test_classes_are_drawn_by_share_and_clips_by_weight(dataset: MotionDataset, generator: torch.Generator) -> None:

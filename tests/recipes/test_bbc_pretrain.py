@@ -162,3 +162,24 @@ def test_a_gated_reward_is_paid_in_proportion_to_the_speed(module: Callable[[str
     parts.env.rewards.pop("velocity_progress")
     assert torch.equal(style_and_skill(1.0), style_and_skill(0.0))
     parts.env.close()
+
+
+def test_an_anchor_holds_the_policy_to_the_one_it_started_from(
+    module: Callable[[str], ModuleType], finished: Path
+) -> None:
+    recipe, setup, presets = module("bbc_pretrain"), module("bbc_setup"), module("bbc_presets")
+    imitation = replace(presets.SMOKE.imitation, anchor=2.0)
+    parts = setup.build(replace(presets.SMOKE, imitation=imitation, init_from=finished / "whole"))
+    batch = parts.rollout.collect(parts.bbc.privileged_policy()).flatten()[:32]
+    parts.bbc.load_state_dict(parts.anchor.state_dict())
+    assert recipe.distance_to_anchor(parts, batch) == 0.0
+    linear = [layer for layer in parts.bbc.actor.modules() if isinstance(layer, torch.nn.Linear)]
+    with torch.no_grad():
+        linear[-1].bias += 0.3  # moves every mean action by as much
+    distance = recipe.distance_to_anchor(parts, batch)
+    torch.testing.assert_close(distance, torch.tensor(0.09))
+    distance.backward()
+    assert all(parameter.grad is None for parameter in parts.anchor.parameters())
+    assert any(parameter.grad is not None for parameter in parts.bbc.actor.parameters())
+    with pytest.raises(ValueError, match="anchor holds on to the policy of --init-from"):
+        setup.build(replace(presets.SMOKE, imitation=imitation))
