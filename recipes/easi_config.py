@@ -68,7 +68,7 @@ class Config:
     """Robot log: .mcap, .csv or .npz."""
     policy: Path | None = None
     """Run or artifact folder of the BBC that made the log; the open-loop trot of ``record_log.py`` without one."""
-    behaviours: tuple[str, ...] = ("walk", "trot")
+    behaviours: tuple[str, ...] = ("pace", "trot")
     """What the BBC was told to do, as in ``record_log.py``."""
     command_seconds: float = 1.0
     """Time between two commands, as in ``record_log.py``."""

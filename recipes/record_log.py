@@ -61,8 +61,8 @@ class Config:
     """Rows: 80 s at 50 Hz (supplement S2)."""
     policy: Path | None = None
     """Run or artifact folder of a BBC; an open-loop trot without one."""
-    behaviours: tuple[str, ...] = ("walk", "trot")
-    """What the BBC is told to do, each turning left and right, in turn."""
+    behaviours: tuple[str, ...] = ("pace", "trot")
+    """What the BBC is told to do, each turning left and right, in turn. A slow walk tells little about damping."""
     command_seconds: float = 1.0
     """Time between two commands."""
     truth: Truth = field(default_factory=Truth)
