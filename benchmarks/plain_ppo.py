@@ -97,6 +97,7 @@ class Plain:
         for name in ("angular_velocity", "joint_velocity"):
             self.weight[features.layout_slice(features.MOTION_LAYOUT, name)] = im.velocity_weight
         self.unlabelled = dataset.sample_unlabelled(50_000, self.generator)[keys.MOTION]
+        self.recorded = dataset.sample_unlabelled(50_000, self.generator, as_recorded=True)[keys.MOTION]
         labelled = dataset.sample_labelled(50_000, self.generator)
         order = labelled[keys.SKILL].argsort()
         self.labelled, self.labels = labelled[keys.MOTION][order], labelled[keys.SKILL][order]
@@ -200,7 +201,10 @@ class Plain:
             self.imitation_optimizer.zero_grad(set_to_none=True)
             loss.backward()
             self.imitation_optimizer.step()
-            self.prior.lerp_(q.detach().mean(0), im.prior_weight)
+            with torch.no_grad():
+                recorded = self.recorded[self.integers(len(self.recorded), im.batch_size)]
+                told = self.skill(self.trunk(self.normalize(recorded).flatten(1))).softmax(-1)
+                self.prior.lerp_(told.mean(0), im.prior_weight)
 
     @torch.no_grad()
     def expert(self, unlabelled: Tensor, policy_skill: Tensor) -> tuple[Tensor, Tensor]:
@@ -278,17 +282,15 @@ class Plain:
         elif 0.0 < kl < 0.5 * ppo.desired_kl:
             group["lr"] = min(group["lr"] * 1.5, ppo.max_learning_rate)
 
-    def update_adaptation(self, batch: dict[str, Tensor], with_history: bool) -> None:
-        names = (keys.PROPRIOCEPTION, keys.EXPLICIT, *((keys.HISTORY, keys.PRIVILEGED) if with_history else ()))
+    def update_adaptation(self, batch: dict[str, Tensor]) -> None:
+        names = (keys.PROPRIOCEPTION, keys.EXPLICIT, keys.HISTORY, keys.PRIVILEGED)
         flat = {name: batch[name].flatten(0, 1) for name in names}
         order = torch.randperm(self.steps * self.n, generator=self.generator)
         for rows in order.chunk(self.cfg.adaptation.minibatches):
             error = self.estimator(flat[keys.PROPRIOCEPTION][rows]) - flat[keys.EXPLICIT][rows]
-            loss = error.square().mean()
-            if with_history:
-                with torch.no_grad():
-                    truth = self.privileged(flat[keys.PRIVILEGED][rows])
-                loss = loss + (self.history(flat[keys.HISTORY][rows]) - truth).norm(dim=-1).mean()
+            with torch.no_grad():
+                truth = self.privileged(flat[keys.PRIVILEGED][rows])
+            loss = error.square().mean() + (self.history(flat[keys.HISTORY][rows]) - truth).norm(dim=-1).mean()
             self.adaptation_optimizer.zero_grad(set_to_none=True)
             loss.backward()
             self.adaptation_optimizer.step()
@@ -298,9 +300,7 @@ class Plain:
         adaptation, marks = self.cfg.adaptation, [time.perf_counter()]
         with_history = adaptation.every > 0 and iteration % adaptation.every == adaptation.every - 1
         pull = ramp(iteration, adaptation.privileged_ramp, adaptation.privileged)
-        # The history is 450 numbers a step: it is kept only where something reads it.
-        needed = with_history or pull > 0.0 or self.cfg.ppo.critic_history
-        batch = self.collect(with_history, (*STORED, keys.HISTORY) if needed else STORED)
+        batch = self.collect(with_history, (*STORED, keys.HISTORY))
         marks.append(time.perf_counter())
         self.remember(batch)
         self.update_imitation(iteration)
@@ -308,7 +308,7 @@ class Plain:
         self.add_rewards(batch)
         self.update_policy(batch, pull)
         marks.append(time.perf_counter())
-        self.update_adaptation(batch, with_history)
+        self.update_adaptation(batch)
         marks.append(time.perf_counter())
         return {phase: marks[i + 1] - marks[i] for i, phase in enumerate(PHASES)}
 
@@ -344,6 +344,7 @@ def main() -> None:
     parser.add_argument("--preset", default="cpu", help="preset of bbc_pretrain.py whose settings both loops take")
     parser.add_argument("--iterations", type=int, default=10, help="timed iterations of each loop, run in turns")
     parser.add_argument("--warmup", type=int, default=2, help="iterations of each loop before the timing")
+    parser.add_argument("--start", type=int, default=400, help="first iteration; by then all ramps are over")
     parser.add_argument("--robots", type=int, help="another number of robots")
     parser.add_argument("--bfloat16", action="store_true", help="plain loop: autocast actor and critic")
     parser.add_argument("--only", choices=("plain", "recipe"), help="run one of the two")
@@ -367,7 +368,7 @@ def main() -> None:
     for iteration in range(options.warmup + options.iterations):
         for name, run in runs.items():
             start = time.perf_counter()
-            phases = run(iteration)
+            phases = run(options.start + iteration)
             total = time.perf_counter() - start
             if iteration >= options.warmup:
                 seconds[name].append({p: phases.get(p, phases.get(f"time/{p}", float("nan"))) for p in PHASES})

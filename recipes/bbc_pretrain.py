@@ -23,7 +23,7 @@ import torch
 from bbc_cloning import clone_behaviour
 from bbc_config import Config, ImitationConfig, at, check_changes
 from bbc_presets import PRESETS
-from bbc_setup import Components, build, policy_folder, save_policy
+from bbc_setup import INFERRED, Components, build, policy_folder, save_policy
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -242,15 +242,18 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     lap("imitation")
     metrics |= add_rewards(parts, cfg.imitation, batch, parts.env.dt)
     weight = functional.linear_ramp(iteration, *cfg.adaptation.privileged_ramp, cfg.adaptation.privileged)
-    parts.adaptation_loss.privileged = weight  # the loss applies its own coefficient
+    parts.privileged_loss.privileged = weight  # the loss applies its own coefficient
     if not with_history:
         with torch.no_grad():
             parts.advantage(batch)
+            batch[INFERRED] = parts.bbc.history_encoder(batch.select(keys.HISTORY).flatten())[keys.LATENT].unflatten(
+                0, batch.batch_size
+            )
         kept = cfg.imitation.cloning_weight
         kept -= functional.linear_ramp(iteration, *cfg.imitation.cloning_fade, kept)
 
         def extra(sample: TensorDictBase) -> Tensor:
-            loss = parts.adaptation_loss(sample)["loss_privileged"] if weight > 0.0 else torch.zeros(())
+            loss = parts.privileged_loss(sample)["loss_privileged"] if weight > 0.0 else torch.zeros(())
             if kept > 0.0:
                 loss = loss + kept * parts.demonstrations.error(parts.bbc)
             return loss if parts.anchor is None else loss + cfg.imitation.anchor * distance_to_anchor(parts, sample)

@@ -12,6 +12,7 @@ from bbc_cloning import Demonstrations
 from bbc_config import Config, MotionConfig
 from identified import load_simulator
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
@@ -48,6 +49,9 @@ from agility_rl.training.ppo import PPOUpdate
 from agility_rl.training.rollout import Rollout
 from agility_rl.training.seeding import Seeds, seed_everything
 
+INFERRED = "inferred_latent"
+"""Latent that the history encoder infers, float32 ``[T, N, 29]``, in collected experience."""
+
 
 @dataclass
 class Components:
@@ -69,6 +73,7 @@ class Components:
     discriminator_loss: DiscriminatorLoss
     predictor_loss: PredictorLoss
     adaptation_loss: AdaptationLoss
+    privileged_loss: AdaptationLoss
     estimation_loss: StateEstimationLoss
     policy_optimizer: torch.optim.Optimizer
     imitation_optimizer: torch.optim.Optimizer
@@ -149,6 +154,9 @@ def build(cfg: Config) -> Components:
     )
     predictor = Predictor(trunk=discriminator.trunk)
     adaptation_loss = AdaptationLoss(bbc.history_encoder, bbc.privileged_encoder)
+    # PPO leaves the history encoder as it is: what it infers is computed once for all epochs.
+    inferred = TensorDictModule(torch.nn.Identity(), in_keys=[INFERRED], out_keys=[keys.LATENT])
+    privileged_loss = AdaptationLoss(inferred, bbc.privileged_encoder)
     heads = {"lr": im.encoder_learning_rate, "weight_decay": im.weight_decay}
     policy_optimizer = torch.optim.Adam(
         [*bbc.privileged_encoder.parameters(), *bbc.actor.parameters(), *critic.parameters()],
@@ -214,7 +222,7 @@ def build(cfg: Config) -> Components:
             epochs=ppo.epochs,
             minibatches=ppo.minibatches,
             max_grad_norm=ppo.max_grad_norm,
-            keep=["loc", "scale", keys.HISTORY],
+            keep=["loc", "scale", INFERRED],
             divergence=divergence,
             schedule=schedule,
         ),
@@ -223,6 +231,7 @@ def build(cfg: Config) -> Components:
         ),
         predictor_loss=PredictorLoss(predictor),
         adaptation_loss=adaptation_loss,
+        privileged_loss=privileged_loss,
         estimation_loss=StateEstimationLoss(bbc.estimator),
         policy_optimizer=policy_optimizer,
         imitation_optimizer=torch.optim.Adam(

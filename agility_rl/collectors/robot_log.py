@@ -17,8 +17,9 @@ from agility_rl.go2 import constants, features
 
 MIN_STEPS = 100
 """Fewer rows (2 s) are refused: one stride or two tell no parameters apart. The paper uses 4,000."""
-STOP_TOLERANCE = 0.2
-"""Joints may be measured this far beyond their stops [rad]; more means another order, unit or zero."""
+STOP_TOLERANCE = 0.5
+"""Joints may be measured this far beyond their stops [rad]; more means another order, unit or zero. Simulated stops are
+soft: a weak leg that lands is pressed 0.3 rad beyond them."""
 RATE_TOLERANCE = 0.02
 """Relative deviation of the median period from the control step."""
 PERIOD_TOLERANCE = 0.5
