@@ -1,4 +1,4 @@
-"""Run a controller at 50 Hz in real time against a robot: for now a simulated one, in a process of its own.
+"""Run a controller at 50 Hz in real time against a robot: a simulated one in a process of its own, or a Go2 over DDS.
 
 The robot stands up, moves in the behaviour that is asked for, stops, and sinks down. Ctrl-C stops it at once, as every
 fault does. The process that runs this is the operator.
@@ -7,17 +7,20 @@ In:  an artifact folder (or a run), best after recipes/export.py.
 Out: one MCAP file that opens in Foxglove and rerun, and is a robot log for recipes/easi.py.
 
     python recipes/deploy.py pretrained/bbc --transport mujoco --seconds 20 --skill trot --speed 1.0
+    python recipes/deploy.py pretrained/bbc --transport dds                    # a simulated Go2 that speaks DDS
+    python recipes/deploy.py exported/bbc --transport dds --interface eth0     # a real one: docs/deployment.md first
 
 Status: 0 if all went well, 1 if a fault ended the run or it never began.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import logging
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,9 +33,12 @@ from agility_rl.collectors.log_formats import AXES
 from agility_rl.deploy import Artifact, BehaviourCommand, Controller, DeployedBBC, Mode, Operator, SafetyLimits
 from agility_rl.deploy.behaviour import onnx_network, torch_network
 from agility_rl.deploy.controller import StepRecord
+from agility_rl.deploy.dds import DOMAIN, DDSTransport
 from agility_rl.deploy.deadlines import Clock, Durations, MonotonicClock
 from agility_rl.deploy.loopback import LoopbackTransport
 from agility_rl.deploy.robot_process import RobotProcess
+from agility_rl.deploy.transport import Transport
+from agility_rl.deploy.unitree_messages import FootCalibration
 from agility_rl.go2 import constants, features
 from agility_rl.record import EpisodeRecorder
 from agility_rl.training import cli
@@ -51,8 +57,14 @@ READY_SECONDS = 0.5
 class Config:
     artifact: Annotated[Path, tyro.conf.Positional]
     """Artifact folder of a BBC, or a run with one."""
-    transport: Literal["mujoco"] = "mujoco"
-    """What to drive."""
+    transport: Literal["mujoco", "dds"] = "mujoco"
+    """How to reach the robot: a simulated one by packets of our own, or LowCmd and LowState over DDS (extra dds)."""
+    interface: str | None = None
+    """With dds: network interface of a real robot; without one, a simulated robot on the loopback interface."""
+    domain: int = DOMAIN
+    """With dds: domain."""
+    feet: FootCalibration = field(default_factory=FootCalibration)
+    """With dds: from counts of the foot sensors to newtons."""
     seconds: float = 20.0
     """Time in the behaviour, without standing up and sinking down."""
     skill: str = "trot"
@@ -181,7 +193,7 @@ def load(cfg: Config) -> tuple[Artifact, DeployedBBC]:
     return artifact, DeployedBBC(network, artifact)
 
 
-def summary(controller: Controller, lost: float, started: float) -> str:
+def summary(controller: Controller, lost: float | None, started: float) -> str:
     """What the loop did, in lines."""
 
     def quantiles(durations: Durations) -> str:
@@ -199,8 +211,9 @@ def summary(controller: Controller, lost: float, started: float) -> str:
         f"control steps: {deadlines.periods}, missed {deadlines.misses} ({share:.2%})",
         f"one step: {quantiles(deadlines.durations)}",
         f"late by: {quantiles(deadlines.latenesses)}",
-        f"the simulated robot lost {lost:.3f} s against real time",
     ]
+    if lost is not None:
+        lines.append(f"the simulated robot lost {lost:.3f} s against real time")
     return "\n".join(lines)
 
 
@@ -211,21 +224,33 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
     path = free_file(Path("runs") / "deploy") if cfg.output is None else cfg.output
     if path.suffix != ".mcap" or path.exists():
         raise ValueError(f"expected --output to be a new file that ends in .mcap, got {path}")
+    if cfg.interface is not None and cfg.transport != "dds":
+        raise ValueError(f"expected --interface only with --transport dds, got --transport {cfg.transport}")
     friction = artifact.manifest.get("simulation", {}).get("friction_loss", 0.0)
     robot_options: dict[str, Any] = {
         "pose": cfg.pose,
         "sim_dt": cfg.sim_dt,
         "friction_loss": friction if cfg.friction_loss is None else cfg.friction_loss,
     }
-    metadata = {"weights": artifact.manifest["weights"]["sha256"], "robot": robot_options, "versions": cli.versions()}
+    real = cfg.interface is not None
+    metadata = {
+        "weights": artifact.manifest["weights"]["sha256"],
+        "robot": {"dds": cfg.interface} if real else robot_options,
+        "versions": cli.versions(),
+    }
     limits = SafetyLimits.from_manifest(
         artifact.manifest,
         state_age=cfg.state_age,
         source_age={"operator": cfg.operator_age},
         missed_deadlines=cfg.missed_deadlines,
     )
-    with RobotProcess(**robot_options) as robot, EpisodeRecorder(path, dt=bbc.period, metadata=metadata) as episode:
-        transport = LoopbackTransport(robot.port, patience=60.0)
+    dds = {"domain": cfg.domain} if cfg.transport == "dds" else None
+    simulated = contextlib.nullcontext() if real else RobotProcess(dds=dds, **robot_options)
+    with simulated as robot, EpisodeRecorder(path, dt=bbc.period, metadata=metadata) as episode:
+        if robot is None or dds is not None:
+            transport: Transport = DDSTransport(cfg.interface, domain=cfg.domain, feet=cfg.feet, patience=60.0)
+        else:
+            transport = LoopbackTransport(robot.port, patience=60.0)
         started = clock.now()
         operator = Operator(command, started)
         controller = Controller(transport, bbc, operator, limits=limits, clock=clock)
@@ -246,7 +271,7 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
         finally:
             gc.unfreeze()
             transport.close()
-    print(summary(controller, robot.lost, started))
+    print(summary(controller, None if robot is None else robot.lost, started))
     print(f"recorded: {path}, {episode.num_steps} steps")
     return path, controller
 

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import torch
 
@@ -42,6 +42,45 @@ LISTENER_MEMORY = 2.0
 """Time without a word after which a listener gets no more states [s]."""
 
 
+class Served(Protocol):
+    """A simulated robot at one end of some line."""
+
+    robot: SimulatedRobot
+
+    def receive(self) -> None:
+        """Obey what has arrived."""
+
+    def publish(self) -> None:
+        """Say the state."""
+
+    def close(self) -> None:
+        """Release the line."""
+
+
+def in_real_time(served: Served, seconds: float | None = None, stopped: Callable[[], bool] = lambda: False) -> float:
+    """Step a robot in real time, obeying and telling, until told to stop or for some time.
+
+    Source: supplement S3 (motors at 1,000 Hz).
+
+    Returns:
+        Simulated seconds that could not be made up for.
+    """
+    begun = due = time.monotonic()
+    lost = 0.0
+    while not stopped() and (seconds is None or time.monotonic() - begun < seconds):
+        due += STATE_PERIOD
+        now = time.monotonic()
+        if now < due:
+            time.sleep(due - now)
+        elif now - due > MOST_BEHIND:
+            lost += now - due - MOST_BEHIND
+            due = now - MOST_BEHIND
+        served.receive()
+        served.robot.advance(STATE_PERIOD)
+        served.publish()
+    return lost
+
+
 class RobotServer:
     """Steps a simulated robot in real time, obeys the commands that arrive, and tells its state to who asked.
 
@@ -69,18 +108,7 @@ class RobotServer:
 
     def serve(self, seconds: float | None = None, stopped: Callable[[], bool] = lambda: False) -> None:
         """Run in real time until told to stop, or for some time."""
-        begun = due = time.monotonic()
-        while not stopped() and (seconds is None or time.monotonic() - begun < seconds):
-            due += STATE_PERIOD
-            now = time.monotonic()
-            if now < due:
-                time.sleep(due - now)
-            elif now - due > MOST_BEHIND:
-                self.lost += now - due - MOST_BEHIND
-                due = now - MOST_BEHIND
-            self.receive()
-            self.robot.advance(STATE_PERIOD)
-            self.publish()
+        self.lost += in_real_time(self, seconds, stopped)
 
     def receive(self) -> None:
         """Take everything that has arrived; the newest command counts, whoever sent it."""
@@ -128,6 +156,8 @@ class RobotProcess:
     Args:
         pose: ``lying`` or ``standing``.
         port: to listen on; 0 takes a free one.
+        dds: speak as a Go2 over DDS instead: keyword arguments ``interface`` and ``domain`` of
+            :class:`agility_rl.deploy.dds.DDSRobot`; :attr:`port` is then 0.
         **robot_options: keyword arguments of :class:`agility_rl.deploy.simulated.SimulatedRobot`, as JSON values.
 
     Attributes:
@@ -138,8 +168,11 @@ class RobotProcess:
         RuntimeError: if the process does not come up.
     """
 
-    def __init__(self, *, pose: str = "lying", port: int = 0, **robot_options: Any) -> None:
-        command = [sys.executable, "-m", __name__, json.dumps({"pose": pose, "port": port, **robot_options})]
+    def __init__(
+        self, *, pose: str = "lying", port: int = 0, dds: dict[str, Any] | None = None, **robot_options: Any
+    ) -> None:
+        options = {"pose": pose, "port": port, "dds": dds, **robot_options}
+        command = [sys.executable, "-m", __name__, json.dumps(options)]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
         self.lost = 0.0
@@ -173,17 +206,28 @@ class RobotProcess:
             self.lost = float(json.loads(output)["lost"])
 
 
+def serve_on(line: dict[str, Any], robot: SimulatedRobot) -> tuple[Served, int]:
+    """The robot's end of the line that was asked for, and its port."""
+    if line["dds"] is None:
+        server = RobotServer(robot, line["port"])
+        return server, server.port
+    from agility_rl.deploy.dds import DDSRobot  # only who uses DDS needs it
+
+    return DDSRobot(robot, **line["dds"]), 0
+
+
 def main(options: dict[str, Any]) -> None:
     """Body of the process: says its port, and ends when its input is closed, also by the death of who started it."""
-    robot = SimulatedRobot(**{name: value for name, value in options.items() if name not in ("pose", "port")})
-    robot.reset(options["pose"])
+    pose, line = options.pop("pose"), {name: options.pop(name) for name in ("port", "dds")}
+    robot = SimulatedRobot(**options)
+    robot.reset(pose)
     robot.advance(SETTLE_SECONDS)
-    server = RobotServer(robot, options["port"])
-    sys.stdout.write(json.dumps({"port": server.port}) + "\n")
+    served, port = serve_on(line, robot)
+    sys.stdout.write(json.dumps({"port": port}) + "\n")
     sys.stdout.flush()
-    server.serve(stopped=lambda: bool(select.select([sys.stdin], [], [], 0)[0]))
-    server.close()
-    sys.stdout.write(json.dumps({"lost": server.lost}) + "\n")
+    lost = in_real_time(served, stopped=lambda: bool(select.select([sys.stdin], [], [], 0)[0]))
+    served.close()
+    sys.stdout.write(json.dumps({"lost": lost}) + "\n")
 
 
 if __name__ == "__main__":
