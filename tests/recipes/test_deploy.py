@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -47,6 +48,30 @@ def test_a_run_is_recorded_as_a_robot_log(
     assert bool(running[~log.start].all())
     assert episode["timing/duration"].min() > 0.0 and (episode["timing/time"].diff() > 0).all()
     assert 0.2 < episode["root_position"][running][:, 2].median() < 0.35
+
+
+def test_the_same_controller_drives_a_robot_that_speaks_dds(
+    deploy: ModuleType, untrained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("cyclonedds", reason="needs the extra dds")
+    patient = {"state_age": 600.0, "operator_age": 600.0, "missed_deadlines": 10**9}
+    domain = 1 + os.getpid() % 100  # another run at the same time must not command this robot
+    path = tmp_path / "run.mcap"
+    cfg = deploy.Config(
+        untrained, transport="dds", domain=domain, seconds=1.0, skill="walk", output=path, pose="standing", **patient
+    )
+    assert deploy.main(cfg) == 0, capsys.readouterr().out
+    assert "run        requested" in capsys.readouterr().out
+    log, episode = RobotLog.load(path), read_episode(path)
+    assert len(log.transitions()) > 0
+    assert episode["root_position"][:, :2].abs().max() == 0.0, "nothing tells where the robot is, as on a real one"
+    standing = episode["joint_position"][episode["timing/time"] < 0.1].mean(0)
+    assert standing[constants.JOINT_NAMES.index("FL_calf_joint")] < -1.0, "our joints, in our order"
+
+
+def test_an_interface_is_one_of_dds(deploy: ModuleType, untrained: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="--interface only with --transport dds, got --transport mujoco"):
+        deploy.main(deploy.Config(untrained, interface="eth0", output=tmp_path / "run.mcap"))
 
 
 def test_a_file_is_never_overwritten_and_a_bad_name_is_named(
