@@ -15,7 +15,6 @@ from torch.nn.functional import avg_pool1d, max_pool1d, mse_loss, pad
 
 from agility_rl import keys, rotations
 from agility_rl.behaviours import BEHAVIOURS, JUMP, NUM_BEHAVIOURS, command_vector
-from agility_rl.envs.robots import PEAK_WINDOW
 from agility_rl.go2 import constants, features
 from agility_rl.modules import BasicBehaviourController
 from agility_rl.motion import MotionClip
@@ -42,7 +41,7 @@ def demonstration(clip: MotionClip, privileged: Tensor, generator: torch.Generat
     height = clip.root_position[:, 2:]
     window = round(SMOOTHING / clip.dt)
     wanted = _pool(torch.cat((velocity[:, :2], turning[:, 2:], height), -1), window, avg_pool1d)
-    leap = round(PEAK_WINDOW / clip.dt)
+    leap = round(features.PEAK_WINDOW / clip.dt)
     jumping = float(skill == JUMP)
     peak = _pool(height, leap, max_pool1d)
     command = torch.cat((wanted[:, :3], jumping * peak, (1.0 - jumping) * wanted[:, 3:]), -1)

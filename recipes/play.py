@@ -27,7 +27,7 @@ from torch import Tensor
 
 from agility_rl import rotations
 from agility_rl.behaviours import BEHAVIOURS, COMMANDS, command_bounds, skill_index
-from agility_rl.envs.observations import FOOT_CONTACT_FORCE
+from agility_rl.go2 import features
 from agility_rl.record import EpisodeRecorder, read_episode
 from agility_rl.record.layout import write_layout
 
@@ -102,7 +102,7 @@ def perform(controller: Controller, config: Config, path: Path) -> str | None:
                 simulator.root_quaternion[0],
                 simulator.joint_position[0],
                 joint_velocity=simulator.joint_velocity[0],
-                foot_contact=simulator.contact_force[0, 1:].unflatten(-1, (4, 4))[:, 3] > FOOT_CONTACT_FORCE,
+                foot_contact=simulator.contact_force[0, 1:].unflatten(-1, (4, 4))[:, 3] > features.FOOT_CONTACT_FORCE,
                 signals={
                     "command": dict(zip(COMMANDS, schedule[step // steps][2][0].tolist(), strict=True)),
                     "behaviour": {"name": name},

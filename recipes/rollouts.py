@@ -18,7 +18,7 @@ from agility_rl import rotations
 from agility_rl.behaviours import NUM_BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.envs import LocomotionEnv
-from agility_rl.envs.observations import FOOT_CONTACT_FORCE
+from agility_rl.go2 import features
 from agility_rl.go2.kinematics import forward
 from agility_rl.modules import BasicBehaviourController
 from agility_rl.motion import MotionClip, MotionDataset, load_clips
@@ -178,7 +178,7 @@ def record(bbc: BasicBehaviourController, env: LocomotionEnv, schedule: Schedule
             (
                 rotations.rotate_inverse(heading[:, None], feet),
                 contacts(feet + position[:, None]),
-                simulator.contact_force[:, 1:].unflatten(-1, (4, 4))[..., 3] > FOOT_CONTACT_FORCE,
+                simulator.contact_force[:, 1:].unflatten(-1, (4, 4))[..., 3] > features.FOOT_CONTACT_FORCE,
                 position[:, 2],
                 rotations.rotate_inverse(heading, simulator.root_linear_velocity),
                 rotations.rotate(turn, simulator.root_angular_velocity)[:, 2],

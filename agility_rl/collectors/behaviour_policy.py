@@ -10,7 +10,6 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from agility_rl import keys
-from agility_rl.envs.observations import HISTORY
 from agility_rl.go2 import features
 
 
@@ -62,7 +61,7 @@ class BehaviourPolicy:
         present = features.proprioception(*(measured[name] for name in entries))
         is_init = measured["is_init"]
         if self._history is None or len(self._history) != len(present):
-            self._history = torch.zeros(len(present), HISTORY, present.shape[-1])
+            self._history = torch.zeros(len(present), features.HISTORY, present.shape[-1])
             self._steps = torch.zeros(len(present), dtype=torch.int64)
         assert self._steps is not None
         shifted = torch.cat((self._history[:, 1:], present[:, None]), 1)

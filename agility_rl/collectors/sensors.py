@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from agility_rl import rotations
-from agility_rl.envs.observations import FOOT_CONTACT_FORCE
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator
 
@@ -97,7 +96,7 @@ def _present(simulator: Simulator, touched: Tensor) -> Tensor:
 
 
 def _touching(simulator: Simulator) -> Tensor:
-    return simulator.contact_force[:, list(constants.FOOT_GROUPS)] > FOOT_CONTACT_FORCE
+    return simulator.contact_force[:, list(constants.FOOT_GROUPS)] > features.FOOT_CONTACT_FORCE
 
 
 def _half_width(noise: float | Mapping[str, float]) -> Tensor:

@@ -21,7 +21,7 @@ from agility_rl.envs.course import Course
 from agility_rl.envs.course_presets import full_course
 from agility_rl.envs.decisions import COMMAND_NOISE, NUM_PARAMETERS, Decisions
 from agility_rl.envs.depth import DepthObservation
-from agility_rl.envs.observations import HISTORY, ObservationGroups
+from agility_rl.envs.observations import ObservationGroups
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.envs.outcome import DecisionOutcome, outcome_specs
 from agility_rl.envs.progress import GOAL_RADIUS, Events
@@ -165,7 +165,7 @@ class AgilityEnv(EnvBase):
                 keys.PROPRIOCEPTION: group(features.NUM_PROPRIOCEPTION),
                 keys.EXPLICIT: group(features.NUM_EXPLICIT),
                 keys.PRIVILEGED: group(29),
-                keys.HISTORY: group(HISTORY, features.NUM_PROPRIOCEPTION),
+                keys.HISTORY: group(features.HISTORY, features.NUM_PROPRIOCEPTION),
                 keys.COMMAND: group(len(behaviours.COMMANDS) + 1 + behaviours.NUM_BEHAVIOURS),
                 keys.PEAK: group(1),
                 keys.MOTION: group(len(self.observations.motion_offsets), features.NUM_MOTION),

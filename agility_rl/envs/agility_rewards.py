@@ -15,7 +15,7 @@ from torch import Tensor
 
 from agility_rl.envs import rewards
 from agility_rl.envs.agility_state import AgilityState
-from agility_rl.envs.observations import FOOT_CONTACT_FORCE
+from agility_rl.go2 import features
 
 TERMINATION = -50.0
 """Weight of a failure, times the control step (section 5.6)."""
@@ -60,7 +60,7 @@ def collision_of_any_body(state: AgilityState) -> Tensor:
 
 def edge_contact(state: AgilityState) -> Tensor:
     """Number of feet that stand on the edge of an obstacle (S5)."""
-    return ((state.robot.foot_contact > FOOT_CONTACT_FORCE) & state.foot_on_edge).sum(-1).float()
+    return ((state.robot.foot_contact > features.FOOT_CONTACT_FORCE) & state.foot_on_edge).sum(-1).float()
 
 
 def decision_smoothness(state: AgilityState) -> Tensor:

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.commands import CommandSampler
-from agility_rl.envs.observations import HISTORY, ObservationGroups
+from agility_rl.envs.observations import ObservationGroups
 from agility_rl.envs.randomization import Randomization
 from agility_rl.envs.reference import PAST, ReferenceStates
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm
@@ -119,7 +119,7 @@ class LocomotionEnv(EnvBase):
                 keys.PROPRIOCEPTION: group(features.NUM_PROPRIOCEPTION),
                 keys.EXPLICIT: group(features.NUM_EXPLICIT),
                 keys.PRIVILEGED: group(29),
-                keys.HISTORY: group(HISTORY, features.NUM_PROPRIOCEPTION),
+                keys.HISTORY: group(features.HISTORY, features.NUM_PROPRIOCEPTION),
                 keys.COMMAND: group(len(behaviours.COMMANDS) + 1 + behaviours.NUM_BEHAVIOURS),
                 keys.PEAK: group(1),
                 keys.MOTION: group(len(self.observations.motion_offsets), features.NUM_MOTION),

@@ -14,13 +14,6 @@ from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import features
 
-# Deployment needs them too, so they stand with the features.
-HISTORY, FOOT_CONTACT_FORCE, OBSERVATION_LIMIT = (
-    features.HISTORY,
-    features.FOOT_CONTACT_FORCE,
-    features.OBSERVATION_LIMIT,
-)
-
 
 class ObservationGroups:
     """Builds the named observations of ``N`` robots from their state.
@@ -45,7 +38,7 @@ class ObservationGroups:
     ) -> None:
         self.generator = generator
         self.noise = noise * features.noise_scale(features.PROPRIOCEPTION_LAYOUT) if noise else None
-        self.history = torch.zeros(num_robots, HISTORY, features.NUM_PROPRIOCEPTION)
+        self.history = torch.zeros(num_robots, features.HISTORY, features.NUM_PROPRIOCEPTION)
         features.check_motion_offsets(motion_offsets)
         self.motion_offsets = torch.tensor(motion_offsets)
         self.motion = torch.zeros(num_robots, motion_offsets[-1] + 1, features.NUM_MOTION)
@@ -59,7 +52,7 @@ class ObservationGroups:
             state: the present.
             past: ``[N, span, 49]``, frames of the recorded motion that led here, for discriminators that look back.
         """
-        touched = state.foot_contact > FOOT_CONTACT_FORCE
+        touched = state.foot_contact > features.FOOT_CONTACT_FORCE
         row = mask[:, None]
         self.touched = torch.where(row, touched, self.touched)
         self.history = torch.where(row[..., None], self._measure(state, touched)[:, None], self.history)
@@ -70,7 +63,7 @@ class ObservationGroups:
 
     def update(self, state: LocomotionState) -> None:
         """Append the present to the memories of every robot."""
-        touched = state.foot_contact > FOOT_CONTACT_FORCE
+        touched = state.foot_contact > features.FOOT_CONTACT_FORCE
         measured = self._measure(state, touched | self.touched)
         self.touched = touched
         self.history = torch.cat((self.history[:, 1:], measured[:, None]), 1)
@@ -104,7 +97,7 @@ class ObservationGroups:
         )
         if self.noise is not None:
             measured = measured + self.noise * (2.0 * torch.rand(measured.shape, generator=self.generator) - 1.0)
-        return measured.clamp(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+        return measured.clamp(-features.OBSERVATION_LIMIT, features.OBSERVATION_LIMIT)
 
     def state_dict(self) -> dict[str, Any]:
         """The memories."""

@@ -15,7 +15,6 @@ from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator
 
-PEAK_WINDOW = features.PEAK_WINDOW
 STRIDE = 0.5
 """Time constant over which a robot's velocity is averaged [s]: a dog does not walk at a constant speed."""
 CLEARANCE = 0.005
@@ -58,7 +57,7 @@ class Robots:
         self._action_scale = torch.tensor(constants.ACTION_SCALE)
         self.action, self.torque, self.joint_velocity = (torch.zeros(n, constants.NUM_JOINTS) for _ in range(3))
         self.mean_velocity = torch.zeros(n, 3)
-        self.heights = torch.zeros(n, round(PEAK_WINDOW / self.dt))
+        self.heights = torch.zeros(n, round(features.PEAK_WINDOW / self.dt))
         fields, self.privileged = sample_parameters(n, NOMINAL, generator)
         self.stiffness, self.damping = fields["stiffness"], fields["damping"]
 

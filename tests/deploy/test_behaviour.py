@@ -16,7 +16,7 @@ from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.deploy.behaviour import INPUTS, BBCNetwork, DeployedBBC, onnx_network, torch_network
 from agility_rl.deploy.commander import BehaviourCommand
 from agility_rl.deploy.transport import RobotState
-from agility_rl.envs import LocomotionEnv, observations, robots
+from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.terminations import diverged
 from agility_rl.go2 import constants, features
 from agility_rl.modules import BasicBehaviourController
@@ -100,11 +100,6 @@ def test_feet_touch_when_they_did_one_step_earlier(deployed: DeployedBBC) -> Non
             float(deployed.observe(replace(RobotState.standing(), foot_force=torch.full((4,), force)))[contact][0])
         )
     assert found == [0.5, 0.5, -0.5, 0.5]
-
-
-def test_constants_are_shared_with_the_training() -> None:
-    assert (observations.HISTORY, observations.FOOT_CONTACT_FORCE) == (features.HISTORY, features.FOOT_CONTACT_FORCE)
-    assert robots.PEAK_WINDOW == features.PEAK_WINDOW == 0.9
 
 
 def test_act_needs_an_observation(deployed: DeployedBBC) -> None:

@@ -7,8 +7,8 @@ import torch
 
 from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.randomization import Randomization
-from agility_rl.envs.robots import PEAK_WINDOW, STRIDE, Pushes, Robots
-from agility_rl.go2 import constants
+from agility_rl.envs.robots import STRIDE, Pushes, Robots
+from agility_rl.go2 import constants, features
 from agility_rl.simulation import make_simulator
 
 
@@ -37,7 +37,7 @@ def test_heights_count_from_the_given_ground_and_peaks_last_their_window() -> No
     robots.begin(torch.ones(2, dtype=torch.bool), commands)
     start = robots.simulator.root_position[:, 2] - 0.1
     torch.testing.assert_close(robots.state(robots.action, commands).root_height[:, 0], start)
-    for _ in range(round(PEAK_WINDOW / 0.02) - 1):
+    for _ in range(round(features.PEAK_WINDOW / 0.02) - 1):
         robots.step(torch.zeros(2, 12))
     torch.testing.assert_close(robots.state(robots.action, commands).peak_height, start)
     robots.step(torch.zeros(2, 12))
