@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -106,6 +105,17 @@ def test_median_of_what_was_measured_by_hand() -> None:
     assert downsample(counts)[0][0, 0] == 700
 
 
+def test_median_equals_numpys_where_everything_is_seen() -> None:
+    counts = np.random.default_rng(0).integers(1, 2**15, (480, 848)).astype(np.uint16)
+    taken = np.array([1, 3, 4, 6])
+    for row, column in ((0, 0), (57, 86), (30, 40)):
+        rows, columns = (8 * (at + crop) + taken for at, crop in ((row, camera.CROP_TOP), (column, camera.CROP_LEFT)))
+        samples = np.sort(counts[np.ix_(rows, columns)], axis=None).astype(int)
+        near, far = samples[7:9]
+        expected = (near + far) // 2 if far - near <= near // 16 else near
+        assert downsample(counts)[0][row, column] == expected
+
+
 def test_an_edge_is_not_smeared_into_the_air() -> None:
     counts = np.full((480, 848), 3000, dtype=np.uint16)
     counts[:, :405] = 1000  # cuts through a pixel
@@ -158,14 +168,3 @@ def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(ImportError, match=r"agility_rl\[video\]"):
         DepthPreprocessor()
-
-
-def test_a_frame_takes_less_than_four_milliseconds_of_one_core(preprocess: DepthPreprocessor) -> None:
-    counts = d435i(scene(*directions()), np.random.default_rng(1))
-    preprocess(counts)
-    times = []
-    for _ in range(20):
-        start = time.process_time()
-        preprocess(counts)
-        times.append(time.process_time() - start)
-    assert min(times) < 4e-3  # the fastest: others may share the core

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -234,11 +233,6 @@ def test_the_papers_set(data: Path, generator: torch.Generator) -> None:
     assert torch.isfinite(motion).all()
     states = dataset.sample_states(torch.randint(5, (4096,), generator=generator), generator)
     assert states["root_height"].min() > 0.2 and states["root_height"].max() < 0.55
-    start = time.perf_counter()
-    for _ in range(10):
-        dataset.sample_unlabelled(1228, generator)
-    # About 0.5 ms a batch; the bound only catches a loop over samples.
-    assert (time.perf_counter() - start) / 10 < 0.05
 
 
 def test_a_pool_that_stands_still_has_usable_statistics() -> None:
