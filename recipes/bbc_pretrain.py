@@ -23,7 +23,8 @@ import torch
 from bbc_cloning import clone_behaviour
 from bbc_config import Config, ImitationConfig, at, check_changes
 from bbc_presets import PRESETS
-from bbc_setup import INFERRED, Components, build, policy_folder, save_policy
+from bbc_setup import ANCHORED, Components, build, policy_folder, save_policy
+from held_fixed import infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -65,13 +66,20 @@ def update_imitation(parts: Components, cfg: ImitationConfig, iteration: int) ->
         parts.imitation_optimizer.zero_grad(set_to_none=True)
         loss.backward()
         parts.imitation_optimizer.step()
-        recorded = parts.dataset.sample_unlabelled(cfg.batch_size, parts.generator, as_recorded=True)
-        with torch.no_grad():
-            parts.prior.update(parts.predictor(recorded)[keys.SKILL_LOGITS].softmax(-1).mean(0))
+        parts.prior.update(recorded_shares(parts, cfg, predicted))
         for name, value in (*discriminated.items(), *predicted.items()):
             if value.numel() == 1:
                 totals[name] = totals.get(name, torch.zeros(())) + value.detach() / cfg.minibatches
     return totals
+
+
+@torch.no_grad()
+def recorded_shares(parts: Components, cfg: ImitationConfig, predicted: TensorDictBase) -> Tensor:
+    """``[5]``, how often Q^c finds each behaviour in unlabelled motion as it was recorded (Algorithm S1, line 9)."""
+    if parts.dataset.as_recorded:
+        return predicted["unlabelled_skill_probability"]
+    recorded = parts.dataset.sample_unlabelled(cfg.batch_size, parts.generator, as_recorded=True)
+    return parts.predictor(recorded)[keys.SKILL_LOGITS].softmax(-1).mean(0)
 
 
 def warm_up_predictor(parts: Components, cfg: ImitationConfig) -> None:
@@ -142,12 +150,19 @@ def speed_share(parts: Components, batch: TensorDictBase) -> Tensor:
     return batch["next", keys.REWARD_TERMS, "velocity_progress"] / (term.weight * parts.env.dt)
 
 
+@torch.no_grad()
+def hold(parts: Components, batch: TensorDictBase) -> None:
+    """Write the anchor's mean action beside the experience."""
+    assert parts.anchor is not None
+    policy = parts.anchor.trained_actor()[:-1]
+    flat = policy(batch.select(*policy.in_keys).flatten())
+    batch[ANCHORED] = flat["loc"].unflatten(0, batch.batch_size)
+
+
 def distance_to_anchor(parts: Components, sample: TensorDictBase) -> Tensor:
     """Mean squared difference between the mean actions of policy and anchor [action units squared]."""
-    assert parts.anchor is not None
-    now, held = (bbc.trained_actor()[:-1] for bbc in (parts.bbc, parts.anchor))
-    inputs = sample.select(*now.in_keys)
-    return torch.nn.functional.mse_loss(now(inputs.clone(False))["loc"], held(inputs.clone(False))["loc"])
+    policy = parts.bbc.trained_actor()[:-1]
+    return torch.nn.functional.mse_loss(policy(sample.select(*policy.in_keys))["loc"], sample[ANCHORED])
 
 
 def update_adaptation(parts: Components, minibatches: int, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -246,9 +261,10 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     if not with_history:
         with torch.no_grad():
             parts.advantage(batch)
-            batch[INFERRED] = parts.bbc.history_encoder(batch.select(keys.HISTORY).flatten())[keys.LATENT].unflatten(
-                0, batch.batch_size
-            )
+        if weight > 0.0:
+            infer(parts.bbc.history_encoder, batch)
+        if parts.anchor is not None:
+            hold(parts, batch)
         kept = cfg.imitation.cloning_weight
         kept -= functional.linear_ramp(iteration, *cfg.imitation.cloning_fade, kept)
 

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from bbc_cloning import Demonstrations
 from bbc_config import Config, MotionConfig
+from held_fixed import INFERRED, privileged_loss
 from identified import load_simulator
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
@@ -49,8 +49,8 @@ from agility_rl.training.ppo import PPOUpdate
 from agility_rl.training.rollout import Rollout
 from agility_rl.training.seeding import Seeds, seed_everything
 
-INFERRED = "inferred_latent"
-"""Latent that the history encoder infers, float32 ``[T, N, 29]``, in collected experience."""
+ANCHORED = "anchored_action"
+"""Mean action of the anchor, float32 ``[T, N, 12]``, in collected experience."""
 
 
 @dataclass
@@ -154,9 +154,6 @@ def build(cfg: Config) -> Components:
     )
     predictor = Predictor(trunk=discriminator.trunk)
     adaptation_loss = AdaptationLoss(bbc.history_encoder, bbc.privileged_encoder)
-    # PPO leaves the history encoder as it is: what it infers is computed once for all epochs.
-    inferred = TensorDictModule(torch.nn.Identity(), in_keys=[INFERRED], out_keys=[keys.LATENT])
-    privileged_loss = AdaptationLoss(inferred, bbc.privileged_encoder)
     heads = {"lr": im.encoder_learning_rate, "weight_decay": im.weight_decay}
     policy_optimizer = torch.optim.Adam(
         [*bbc.privileged_encoder.parameters(), *bbc.actor.parameters(), *critic.parameters()],
@@ -222,7 +219,7 @@ def build(cfg: Config) -> Components:
             epochs=ppo.epochs,
             minibatches=ppo.minibatches,
             max_grad_norm=ppo.max_grad_norm,
-            keep=["loc", "scale", INFERRED],
+            keep=["loc", "scale", INFERRED, ANCHORED],
             divergence=divergence,
             schedule=schedule,
         ),
@@ -231,7 +228,7 @@ def build(cfg: Config) -> Components:
         ),
         predictor_loss=PredictorLoss(predictor),
         adaptation_loss=adaptation_loss,
-        privileged_loss=privileged_loss,
+        privileged_loss=privileged_loss(bbc.privileged_encoder),
         estimation_loss=StateEstimationLoss(bbc.estimator),
         policy_optimizer=policy_optimizer,
         imitation_optimizer=torch.optim.Adam(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from held_fixed import INFERRED, privileged_loss
 from rollouts import Controller, load_controller
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -101,6 +102,7 @@ class Components:
     rollout: Rollout
     advantage: GAE
     adaptation_loss: AdaptationLoss
+    privileged_loss: AdaptationLoss
     policy_optimizer: torch.optim.Optimizer
     adaptation_optimizer: torch.optim.Optimizer
     ppo: PPOUpdate
@@ -155,7 +157,6 @@ def build(cfg: Config) -> Components:
     schedule = None
     if ppo.desired_kl is not None:
         schedule = KLAdaptiveLR(policy_optimizer, ppo.desired_kl, max_lr=ppo.max_learning_rate)
-    adaptation_loss = AdaptationLoss(teacher.history_encoder, teacher.privileged_encoder)
     outcome = [keys.OUTCOME, keys.TERMINATIONS, keys.REWARD_TERMS, keys.MOTION, keys.SKILL, keys.OBSTACLE]
     return Components(
         seeds=seeds,
@@ -177,7 +178,8 @@ def build(cfg: Config) -> Components:
             value=lambda observation: critic(observation.select(*OBSERVED))["state_value"],
         ),
         advantage=GAE(gamma=ppo.gamma, lmbda=ppo.lmbda, value_network=None, time_dim=0),
-        adaptation_loss=adaptation_loss,
+        adaptation_loss=AdaptationLoss(teacher.history_encoder, teacher.privileged_encoder),
+        privileged_loss=privileged_loss(teacher.privileged_encoder),
         policy_optimizer=policy_optimizer,
         adaptation_optimizer=torch.optim.Adam(
             teacher.history_encoder.parameters(), lr=cfg.adaptation.learning_rate, fused=True
@@ -188,7 +190,7 @@ def build(cfg: Config) -> Components:
             epochs=ppo.epochs,
             minibatches=ppo.minibatches,
             max_grad_norm=ppo.max_grad_norm,
-            keep=["logits", "loc", "scale", keys.HISTORY, keys.PRIVILEGED],
+            keep=["logits", "loc", "scale", INFERRED],
             divergence=divergence,
             schedule=schedule,
         ),

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from held_fixed import infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tsc_config import PRESETS, Config
@@ -117,13 +118,15 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     metrics: dict[str, Any] = judge(parts, batch)
     metrics |= add_rewards(parts, cfg, batch)
     weight = functional.linear_ramp(iteration, *cfg.adaptation.privileged_ramp, cfg.adaptation.privileged)
-    parts.adaptation_loss.privileged = weight  # the loss applies its own coefficient
+    parts.privileged_loss.privileged = weight  # the loss applies its own coefficient
     if not with_history:
         with torch.no_grad():
             parts.advantage(batch)
+        if weight > 0.0:
+            infer(parts.teacher.history_encoder, batch)
 
         def extra(sample: TensorDictBase) -> Tensor:
-            return parts.adaptation_loss(sample)["loss_privileged"] if weight > 0.0 else torch.zeros(())
+            return parts.privileged_loss(sample)["loss_privileged"] if weight > 0.0 else torch.zeros(())
 
         metrics |= parts.ppo(batch, parts.generator, extra)
     lap("policy")

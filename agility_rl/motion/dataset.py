@@ -79,6 +79,8 @@ class MotionDataset:
 
     Attributes:
         labelled_clips: the labelled clips as they are drawn from: resampled, sorted by skill, mirror images included.
+        as_recorded: whether every unlabelled start is as likely as any other, so that samples show the shares of
+            behaviours in the recordings.
 
     Raises:
         MotionError: if there is no unlabelled motion, a labelled clip has no label, or a clip is shorter than a sample.
@@ -133,7 +135,7 @@ class MotionDataset:
             self._unlabelled.weights[standing] *= standing_weight
         self._labelled_table = _cumulative(self._labelled, NUM_BEHAVIOURS)
         self._unlabelled_table = _cumulative(self._unlabelled, 1)
-        self._uniform = bool((self._unlabelled.weights == self._unlabelled.weights[0]).all())
+        self.as_recorded = bool((self._unlabelled.weights == self._unlabelled.weights[0]).all())
         self._present = torch.bincount(self._labelled.groups, minlength=NUM_BEHAVIOURS) > 0
         self._states = {name: torch.cat([getattr(clip, name) for clip in labelled]) for name in _STATE if labelled}
         if labelled:
@@ -152,7 +154,7 @@ class MotionDataset:
             ``motion`` float32 ``[n, H, F]``.
         """
         pool = self._unlabelled
-        if self._uniform or as_recorded:
+        if self.as_recorded or as_recorded:
             pick = torch.randint(len(pool.starts), (n,), generator=generator)
         else:
             pick = _draw(self._unlabelled_table, torch.zeros(n, dtype=torch.int64), generator)

@@ -171,6 +171,7 @@ def test_an_anchor_holds_the_policy_to_the_one_it_started_from(
     imitation = replace(presets.SMOKE.imitation, anchor=2.0)
     parts = setup.build(replace(presets.SMOKE, imitation=imitation, init_from=finished / "whole"))
     batch = parts.rollout.collect(parts.bbc.privileged_policy()).flatten()[:32]
+    recipe.hold(parts, batch)
     parts.bbc.load_state_dict(parts.anchor.state_dict())
     assert recipe.distance_to_anchor(parts, batch) == 0.0
     linear = [layer for layer in parts.bbc.actor.modules() if isinstance(layer, torch.nn.Linear)]
