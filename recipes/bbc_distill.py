@@ -39,8 +39,9 @@ from agility_rl.training.seeding import seed_everything
 
 Act = Callable[[TensorDictBase], Tensor]
 Experience = tuple[TensorDictBase, TensorDictBase]
+LABEL = "label"
+"""Mean action of a row's teacher, float32 ``[B, 12]``."""
 INPUTS = (keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.HISTORY, keys.COMMAND, keys.PEAK, keys.SKILL)
-LAYOUTS = {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT}
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,7 @@ def load_teachers(cfg: Config) -> list[Controller]:
 def labeller(teachers: list[Controller]) -> Act:
     """A function that gives the mean action ``[B, 12]`` of the teacher of each row's behaviour."""
     controllers = {id(teacher.bbc): teacher.bbc for teacher in teachers}
-    own = [list(controllers).index(id(teacher.bbc)) for teacher in teachers]
-    index = torch.tensor(own)
+    index = torch.tensor([list(controllers).index(id(teacher.bbc)) for teacher in teachers])
 
     @torch.no_grad()
     def label(observation: TensorDictBase) -> Tensor:
@@ -125,8 +125,8 @@ def collect(
     rows = []
     for _ in range(cfg.steps):
         row = carrier.select(*INPUTS).clone()
-        row["label"] = label(row)
-        carrier[keys.ACTION] = act(row) + cfg.noise * torch.randn(row["label"].shape, generator=generator)
+        row[LABEL] = label(row)
+        carrier[keys.ACTION] = act(row) + cfg.noise * torch.randn(row[LABEL].shape, generator=generator)
         rows.append(row)
         _, carrier = env.step_and_maybe_reset(carrier)
     return torch.cat(rows), carrier
@@ -140,7 +140,7 @@ def learn(
     adaptation = AdaptationLoss(bbc.history_encoder, bbc.privileged_encoder)
     for _ in range(updates):
         batch = replay.sample()
-        loss = mse_loss(mean_action(bbc, batch), batch.get("label"))
+        loss = mse_loss(mean_action(bbc, batch), batch[LABEL])
         loss = loss + estimation(batch)["loss_estimation"] + adaptation(batch)["loss_adaptation"]
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -150,7 +150,7 @@ def learn(
 def errors(bbc: BasicBehaviourController, data: TensorDictBase) -> dict[str, float]:
     """Root mean square of student minus teacher by behaviour, in action units."""
     with torch.no_grad():
-        squares = (mean_action(bbc, data) - data["label"]).square().mean(-1)
+        squares = (mean_action(bbc, data) - data[LABEL]).square().mean(-1)
     return {name: float(squares[data[keys.SKILL] == index].mean().sqrt()) for index, name in enumerate(BEHAVIOURS)}
 
 
@@ -188,7 +188,7 @@ def main(cfg: Config) -> Path:
         schedule.step()
     env.close()
     known = first.artifact.manifest
-    manifest = build_manifest("bbc", LAYOUTS, control_period=env.dt, data=known["data"])
+    manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=env.dt, data=known["data"])
     manifest |= {name: known[name] for name in ("network", "prior") if name in known}
     manifest["teachers"] = {
         name: teacher.artifact.manifest["weights"]["sha256"] for name, teacher in zip(BEHAVIOURS, teachers, strict=True)

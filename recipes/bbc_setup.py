@@ -269,8 +269,7 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     """Write the controller as an artifact, and beside it the discriminator, whose judgement stage 3 rewards."""
     clips = [cfg.motion.labelled, cfg.motion.unlabelled]
     data = ["/".join(clip.resolve().parts[-2:]) for clip in clips if clip] or ["synthetic gaits of agility_rl"]
-    layouts = {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT}
-    manifest = build_manifest("bbc", layouts, control_period=parts.env.dt, data=data)
+    manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=parts.env.dt, data=data)
     manifest |= {"network": parts.bbc.settings, "prior": parts.prior.probabilities.tolist()}
     Artifact.save(folder / "policy", parts.bbc.state_dict(), manifest)
     layouts = {"motion": features.MOTION_LAYOUT}

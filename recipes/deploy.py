@@ -148,7 +148,7 @@ class Recorder:
         )
 
 
-class Course:
+class Procedure:
     """Asks for one mode after the other: stand up, run for some time, stop, sink down."""
 
     def __init__(self, controller: Controller, operator: Operator, seconds: float) -> None:
@@ -254,17 +254,17 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
         started = clock.now()
         operator = Operator(command, started)
         controller = Controller(transport, bbc, operator, limits=limits, clock=clock)
-        record, course = Recorder(episode, bbc), Course(controller, operator, cfg.seconds)
+        record, procedure = Recorder(episode, bbc), Procedure(controller, operator, cfg.seconds)
 
         def on_step(step: StepRecord) -> None:
             record(step)
-            course(step)
+            procedure(step)
 
         controller.on_step = on_step
         gc.collect()
         gc.freeze()  # what was loaded until here need not be looked through again in the middle of a step
         try:
-            controller.run(until=lambda: course.finished or interrupted())
+            controller.run(until=lambda: procedure.finished or interrupted())
             controller.on_step = record
             for _ in range(round(SINK_SECONDS / bbc.period)):
                 controller.step()

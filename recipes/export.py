@@ -138,10 +138,9 @@ def check_onnx(artifact: Artifact, seen: TensorDict, action: Tensor, estimate: T
 def complete_manifest(controller: Controller) -> dict[str, Any]:
     """The manifest of the training, with what the present format asks for besides."""
     trained = {k: v for k, v in controller.artifact.manifest.items() if k not in _WRITTEN_ANEW}
-    layouts = {keys.PROPRIOCEPTION: features.PROPRIOCEPTION_LAYOUT, keys.EXPLICIT: features.EXPLICIT_LAYOUT}
-    for name, layout in layouts.items():
+    for name, layout in features.CONTROLLER_LAYOUTS.items():
         controller.artifact.check_layout(name, layout)
-    now = build_manifest("bbc", layouts, control_period=trained["control_period"])
+    now = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=trained["control_period"])
     simulation = {"friction_loss": controller.friction_loss, **trained.get("simulation", {})}
     return {**now, **trained, "units": now["units"], "simulation": simulation, "exported_with": now["versions"]}
 

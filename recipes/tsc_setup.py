@@ -263,7 +263,7 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     """Write the teacher as an artifact, with what is needed to run it elsewhere."""
     manifest = build_manifest(
         "teacher",
-        {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT},
+        features.CONTROLLER_LAYOUTS,
         control_period=parts.env.dt * cfg.env.decision_steps,
         data=[],
     )

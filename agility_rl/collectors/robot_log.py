@@ -17,9 +17,11 @@ from agility_rl.go2 import constants, features
 
 MIN_STEPS = 100
 """Fewer rows (2 s) are refused: one stride or two tell no parameters apart. The paper uses 4,000."""
-STOP_TOLERANCE = 0.5
-"""Joints may be measured this far beyond their stops [rad]; more means another order, unit or zero. Simulated stops are
-soft: a weak leg that lands is pressed 0.3 rad beyond them."""
+STOP_TOLERANCE = 0.2
+"""Joints may often be measured this far beyond their stops [rad]; more means another order, unit or zero."""
+LANDING_TOLERANCE, LANDING_SHARE = 0.5, 0.05
+"""Joints may be measured this far beyond their stops [rad] in this share of the rows: simulated stops are soft, and a
+weak leg that lands is pressed 0.3 rad beyond them."""
 RATE_TOLERANCE = 0.02
 """Relative deviation of the median period from the control step."""
 PERIOD_TOLERANCE = 0.5
@@ -228,9 +230,10 @@ class RobotLog:
             )
 
     def _check_joints(self) -> None:
-        lower = torch.tensor(constants.JOINT_LOWER) - STOP_TOLERANCE
-        upper = torch.tensor(constants.JOINT_UPPER) + STOP_TOLERANCE
-        beyond = ((self.joint_position < lower) | (self.joint_position > upper)).nonzero()
+        lower, upper = torch.tensor(constants.JOINT_LOWER), torch.tensor(constants.JOINT_UPPER)
+        excess = torch.maximum(lower - self.joint_position, self.joint_position - upper)
+        often = (excess > STOP_TOLERANCE).any(-1).float().mean() > LANDING_SHARE
+        beyond = (excess > (STOP_TOLERANCE if often else LANDING_TOLERANCE)).nonzero()
         if len(beyond):
             row, joint = beyond[0].tolist()
             raise RobotLogError(

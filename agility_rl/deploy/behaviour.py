@@ -154,8 +154,7 @@ class DeployedBBC:
         >>> import tempfile
         >>> from agility_rl.deploy.artifact import build_manifest
         >>> bbc = BasicBehaviourController(hidden=(8,))
-        >>> layouts = {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT}
-        >>> manifest = build_manifest("bbc", layouts, control_period=0.02, network=bbc.settings)
+        >>> manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=0.02, network=bbc.settings)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     artifact = Artifact.save(folder, bbc.state_dict(), manifest)
         >>> deployed = DeployedBBC(torch_network(artifact), artifact)

@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 FOLDED_POSE = (0.0, 1.36, -2.65) * 4
 """Joint angles [rad] of a robot that lies on its trunk with its legs folded under it."""
 DAMPING_GAIN = 3.0
-"""Damping of every joint in the state ``damping`` [N m s/rad]; public controllers of the Go2 take 3 to 8."""
+"""Damping of every joint in the state ``damping`` [N m s/rad]; chosen by us."""
 FOLD_SECONDS = 1.0
 """Time to fold the legs before standing up [s]."""
 RISE_SECONDS = 1.0
@@ -139,8 +139,7 @@ class Controller:
         >>> from agility_rl.go2 import features
         >>> from agility_rl.modules import BasicBehaviourController
         >>> module = BasicBehaviourController(hidden=(8,))
-        >>> layouts = {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT}
-        >>> manifest = build_manifest("bbc", layouts, control_period=0.02, network=module.settings)
+        >>> manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=0.02, network=module.settings)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     artifact = Artifact.save(folder, module.state_dict(), manifest)
         >>> clock = ManualClock()

@@ -32,23 +32,27 @@ SERVO = 0x01
 NO_POSITION, NO_VELOCITY = 2.146e9, 16000.0
 """Targets that a motor takes for none."""
 REMOTE_L2, REMOTE_B = (2, 1 << 5), (3, 1 << 1)
-"""Byte of ``wireless_remote`` and bit in it that is set while a button of the remote control is pressed."""
+"""Byte of ``wireless_remote`` and bit in it that is set while a button of the remote control is pressed.
+
+Source: ``xKeySwitchUnion`` of Unitree's SDK: R1, L1, start, select, R2, L2 from the lowest bit of byte 2 on, A, B, X, Y
+from that of byte 3 on.
+"""
 
 MOTOR_COMMAND = np.dtype(
     [("mode", "u1"), ("q", "<f4"), ("dq", "<f4"), ("tau", "<f4"), ("kp", "<f4"), ("kd", "<f4"), ("reserve", "<u4", 3)],
     align=True,
 )
 """``MotorCmd_``: 36 bytes."""
+_HEADER: list[Any] = [
+    *(("head", "u1", 2), ("level_flag", "u1"), ("frame_reserve", "u1")),
+    *(("sn", "<u4", 2), ("version", "<u4", 2), ("bandwidth", "<u2")),
+]
+"""With these every low-level message begins."""
 BATTERY_COMMAND = np.dtype([("off", "u1"), ("reserve", "u1", 3)], align=True)
 """``BmsCmd_``: 4 bytes."""
 LOW_COMMAND = np.dtype(
     [
-        ("head", "u1", 2),
-        ("level_flag", "u1"),
-        ("frame_reserve", "u1"),
-        ("sn", "<u4", 2),
-        ("version", "<u4", 2),
-        ("bandwidth", "<u2"),
+        *_HEADER,
         ("motor_cmd", MOTOR_COMMAND, MOTORS),
         ("bms_cmd", BATTERY_COMMAND),
         ("wireless_remote", "u1", 40),
@@ -106,12 +110,7 @@ BATTERY_STATE = np.dtype(
 """``BmsState_``: 44 bytes."""
 LOW_STATE = np.dtype(
     [
-        ("head", "u1", 2),
-        ("level_flag", "u1"),
-        ("frame_reserve", "u1"),
-        ("sn", "<u4", 2),
-        ("version", "<u4", 2),
-        ("bandwidth", "<u2"),
+        *_HEADER,
         ("imu_state", IMU_STATE),
         ("motor_state", MOTOR_STATE, MOTORS),
         ("bms_state", BATTERY_STATE),

@@ -9,6 +9,7 @@ Sources: [S] supplement, sections S3 and S6; [5.8] method notes, section 5.8 (re
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -51,30 +52,24 @@ OFFSET_NOISE, PIXEL_NOISE = 0.05, 0.05
 The notes leave the unit open: metres here, before the clip, as in the code from which the release derives.
 """
 
-MAX_LATENCY_FRAMES = 2
-"""Frames by which an image is late, at most: the release shows the second-newest of two. [5.8]; two frames are ours."""
 
-
-def check_depth(depth: Tensor, *, height: int = IMAGE_HEIGHT, width: int = IMAGE_WIDTH) -> None:
-    """Refuse what is no image of this size.
+def check_image_size(shape: Sequence[int], height: int = IMAGE_HEIGHT, width: int = IMAGE_WIDTH) -> None:
+    """Refuse the shape of what is no image of this size.
 
     Raises:
-        ValueError: if the size is another, the axes are swapped, or a pixel is NaN.
+        ValueError: if the size is another, or the axes are swapped.
 
     Example:
-        >>> check_depth(torch.zeros(3, 58, 87))
-        >>> check_depth(torch.zeros(87, 58))
+        >>> check_image_size((3, 58, 87))
+        >>> check_image_size((87, 58))
         Traceback (most recent call last):
         ...
         ValueError: depth images must be [*B, 58 rows, 87 columns], got [87, 58]: rows and columns are swapped
     """
-    size = tuple(depth.shape[-2:])
+    size = tuple(shape[-2:])
     if size != (height, width):
         advice = ": rows and columns are swapped" if size == (width, height) else ""
-        raise ValueError(f"depth images must be [*B, {height} rows, {width} columns], got {list(depth.shape)}{advice}")
-    if depth.is_floating_point() and bool(torch.isnan(depth).any()):
-        count = int(torch.isnan(depth).sum())
-        raise ValueError(f"{count} pixels of the depth images are NaN; a camera marks what it does not see by 0")
+        raise ValueError(f"depth images must be [*B, {height} rows, {width} columns], got {list(shape)}{advice}")
 
 
 def normalize_depth(depth: Tensor) -> Tensor:
@@ -97,7 +92,10 @@ def normalize_depth(depth: Tensor) -> Tensor:
         >>> round(normalize_depth(torch.full((58, 87), 2.15))[0, 0].item(), 4)
         0.0
     """
-    check_depth(depth)
+    check_image_size(depth.shape)
+    if bool(torch.isnan(depth).any()):
+        count = int(torch.isnan(depth).sum())
+        raise ValueError(f"{count} pixels of the depth images are NaN; a camera marks what it does not see by 0")
     return (depth.clamp(DEPTH_NEAR, DEPTH_FAR) - DEPTH_NEAR) / (DEPTH_FAR - DEPTH_NEAR) - 0.5
 
 

@@ -78,6 +78,12 @@ MEASUREMENT_LAYOUT: tuple[Entry, ...] = (
 )
 """29 numbers of a state as a robot log holds it, in SI units: no trunk velocity, no contact. Noise as above."""
 
+CONTROLLER_LAYOUTS: dict[str, tuple[Entry, ...]] = {
+    "proprioception": PROPRIOCEPTION_LAYOUT,
+    "explicit": EXPLICIT_LAYOUT,
+}
+"""What a controller measures and what it estimates, as its artifact's manifest names them."""
+
 NUM_PROPRIOCEPTION = sum(entry.size for entry in PROPRIOCEPTION_LAYOUT)
 NUM_EXPLICIT = sum(entry.size for entry in EXPLICIT_LAYOUT)
 NUM_MOTION = sum(entry.size for entry in MOTION_LAYOUT)

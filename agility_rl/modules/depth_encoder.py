@@ -6,7 +6,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from agility_rl.go2.camera import IMAGE_HEIGHT, IMAGE_WIDTH, dequantize
+from agility_rl.go2.camera import IMAGE_HEIGHT, IMAGE_WIDTH, check_image_size, dequantize
 from agility_rl.keys import DEPTH, DEPTH_FEATURE
 
 
@@ -81,11 +81,6 @@ class DepthNetwork(nn.Module):
 
     def forward(self, depth: Tensor) -> Tensor:
         """Map images ``[*B, H, W]`` to features ``[*B, F]``."""
-        size = tuple(depth.shape[-2:])
-        if size != (self.height, self.width):
-            advice = ": rows and columns are swapped" if size == (self.width, self.height) else ""
-            raise ValueError(
-                f"depth images must be [*B, {self.height} rows, {self.width} columns], got {list(depth.shape)}{advice}"
-            )
+        check_image_size(depth.shape, self.height, self.width)
         images = dequantize(depth).reshape(-1, 1, self.height, self.width)  # [N, channels, H, W]
         return self.linear(self.convolutions(images)).reshape(*depth.shape[:-2], -1)

@@ -11,6 +11,9 @@ from torch import nn
 from agility_rl.keys import SCANDOTS, TERRAIN_LATENT
 from agility_rl.modules.mlp import ConcatenatedMLP
 
+NUM_TERRAIN_LATENT = 32
+"""Size of the encoding, which the student imitates (supplement, section S6)."""
+
 
 class ScandotsEncoder(TensorDictModule):
     r"""Encode the terrain heights around and ahead of the robot into a bounded latent.
@@ -47,7 +50,7 @@ class ScandotsEncoder(TensorDictModule):
     def __init__(
         self,
         in_features: int = 132,
-        out_features: int = 32,
+        out_features: int = NUM_TERRAIN_LATENT,
         *,
         hidden: Sequence[int] = (128, 64),
         in_key: NestedKey = SCANDOTS,

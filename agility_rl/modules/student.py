@@ -19,10 +19,9 @@ from agility_rl.modules.depth_encoder import DepthEncoder
 from agility_rl.modules.estimator import StateEstimator
 from agility_rl.modules.hybrid_actor import HybridActor
 from agility_rl.modules.mlp import mlp
+from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 from agility_rl.modules.teacher import NUM_HEADING, Teacher
 
-NUM_TERRAIN_LATENT = 32
-"""Size of the teacher's encoding of the scandots, which the student imitates (supplement, section S6)."""
 HEADING_SCALE = 1.5
 """Factor on the predicted heading errors (method notes, section 5.9)."""
 HEADING_GATE = 0.6
@@ -123,7 +122,7 @@ class RecurrentStudent(nn.Module):
         return student
 
     def initial_hidden(self, num_robots: int) -> Tensor:
-        """Memory of robots that have not seen anything, ``[N, 512]``."""
+        """Memory of robots that have not seen anything, ``[N, memory]``."""
         return torch.zeros(num_robots, self.memory.hidden_size, device=next(self.parameters()).device)
 
     def policy(self, *, assisted: bool = False, sequence: bool = False) -> TensorDictSequential:

@@ -14,7 +14,7 @@ from agility_rl.modules.adaptation import HistoryEncoder, PrivilegedEncoder
 from agility_rl.modules.behaviour_controller import NUM_LATENT
 from agility_rl.modules.estimator import StateEstimator
 from agility_rl.modules.hybrid_actor import HybridActor
-from agility_rl.modules.scandots import ScandotsEncoder
+from agility_rl.modules.scandots import NUM_TERRAIN_LATENT, ScandotsEncoder
 
 NUM_HEADING = 2
 """Heading errors to the current and to the next way-point (method notes, section 5.4)."""
@@ -74,7 +74,7 @@ class Teacher(nn.Module):
             keys.PROPRIOCEPTION: features.NUM_PROPRIOCEPTION,
             keys.HEADING_ERROR: NUM_HEADING,
             keys.OBSTACLE: num_obstacles,
-            keys.TERRAIN_LATENT: 32,
+            keys.TERRAIN_LATENT: NUM_TERRAIN_LATENT,
             keys.ESTIMATE: features.NUM_EXPLICIT,
             keys.LATENT: NUM_LATENT,
         }

@@ -3,12 +3,13 @@
 from agility_rl.simulation.batch import BatchSimulator
 from agility_rl.simulation.depth_camera import DepthCamera
 from agility_rl.simulation.scenery import Hinge, Piece, Shape
-from agility_rl.simulation.simulator import PARAMETERS, Simulator, make_simulator
+from agility_rl.simulation.simulator import PARAMETERS, Camera, Simulator, make_simulator
 from agility_rl.simulation.terrain import HeightField, rough_pyramids
 
 __all__ = [
     "PARAMETERS",
     "BatchSimulator",
+    "Camera",
     "DepthCamera",
     "HeightField",
     "Hinge",

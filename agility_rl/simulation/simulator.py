@@ -7,7 +7,6 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from agility_rl.simulation.depth_camera import DepthCamera
 from agility_rl.simulation.scenery import Piece
 
 PARAMETERS: dict[str, tuple[int, str]] = {
@@ -23,6 +22,32 @@ PARAMETERS: dict[str, tuple[int, str]] = {
     "action_delay": (1, "s"),
 }
 """Parameters that may differ between simulations: number of values and unit."""
+
+
+class Camera(Protocol):
+    """A depth camera on each of ``N`` robots, such as :class:`~agility_rl.simulation.DepthCamera`.
+
+    Attributes:
+        pitch: ``[N]``, mounting angle [rad], positive looks down; changed by :meth:`set_pitch`.
+
+    Source: pose, size and field of view: :mod:`agility_rl.go2.camera`.
+
+    Example:
+        >>> from agility_rl.simulation import make_simulator
+        >>> camera: Camera = make_simulator(1, num_threads=1).make_camera()
+        >>> camera.pitch
+        tensor([0.])
+    """
+
+    pitch: Tensor
+
+    def set_pitch(self, mask: Tensor, pitch: Tensor) -> None:
+        """Tilt the cameras of the rows of a bool mask ``[N]`` to angles ``[N]`` [rad]."""
+        ...
+
+    def render(self, mask: Tensor) -> Tensor:
+        """Distances along the optical axis [m], ``[M, 58, 87]``, of the M rows of a mask; infinite where nothing is."""
+        ...
 
 
 class Simulator(Protocol):
@@ -107,7 +132,7 @@ class Simulator(Protocol):
         """Distance [m] to the nearest surface that is not the robot, ``[N, R]``; infinite when there is none."""
         ...
 
-    def make_camera(self) -> DepthCamera:
+    def make_camera(self) -> Camera:
         """A depth camera on every robot, which follows these simulations."""
         ...
 

@@ -126,6 +126,17 @@ def test_nan_in_time() -> None:
     assert "row 9, time is nan" in refused(columns(time=time))
 
 
+def test_a_landing_may_press_a_joint_past_its_stop_but_not_often() -> None:
+    stop = constants.JOINT_UPPER[2]
+    for rows, past, accepted in ((7, 0.4, True), (8, 0.4, False), (150, 0.19, True), (1, 0.6, False)):
+        position = columns()["joint_position"].clone()
+        position[-rows:, 2] = stop + past  # of 150 rows; 5 % are 7.5
+        if accepted:
+            assert len(RobotLog.from_columns(columns(joint_position=position))) == 150
+        else:
+            assert f"row {150 - rows}, joint_position.FL_calf_joint" in refused(columns(joint_position=position))
+
+
 def test_joints_in_another_order_leave_their_stops() -> None:
     by_link = columns()["joint_position"].unflatten(-1, (4, 3)).transpose(1, 2).flatten(1)
     assert "joints in another order" in refused(columns(joint_position=by_link))

@@ -32,8 +32,7 @@ def module() -> BasicBehaviourController:
 
 @pytest.fixture
 def artifact(tmp_path: Path, module: BasicBehaviourController) -> Artifact:
-    layouts = {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT}
-    manifest = build_manifest("bbc", layouts, control_period=0.02, network=module.settings)
+    manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=0.02, network=module.settings)
     return Artifact.save(tmp_path / "policy", module.state_dict(), manifest)
 
 

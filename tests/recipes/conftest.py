@@ -21,8 +21,7 @@ from agility_rl.modules import BasicBehaviourController
 def untrained(tmp_path: Path) -> Path:
     """Run folder with ``policy/`` and nothing else."""
     bbc = BasicBehaviourController(hidden=(16, 16))
-    layouts = {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT}
-    manifest = build_manifest("bbc", layouts, control_period=0.02)
+    manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=0.02)
     manifest |= {"network": bbc.settings, "prior": [0.6, 0.2, 0.1, 0.06, 0.04]}
     Artifact.save(tmp_path / "run" / "policy", bbc.state_dict(), manifest)
     return tmp_path / "run"

@@ -19,7 +19,6 @@ from agility_rl.go2 import features
 from agility_rl.modules import BasicBehaviourController
 
 Module = Callable[[str], ModuleType]
-LAYOUTS = {"proprioception": features.PROPRIOCEPTION_LAYOUT, "explicit": features.EXPLICIT_LAYOUT}
 
 
 def save(folder: Path, seed: int) -> Path:
@@ -27,7 +26,7 @@ def save(folder: Path, seed: int) -> Path:
     bbc = BasicBehaviourController(hidden=(16, 16))
     last = [parameter for name, parameter in bbc.actor.named_parameters() if name.endswith("weight")][-1]
     torch.nn.init.normal_(last, std=0.5)  # two teachers that say clearly different things
-    manifest = build_manifest("bbc", LAYOUTS, control_period=0.02) | {"network": bbc.settings}
+    manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=0.02) | {"network": bbc.settings}
     Artifact.save(folder / "policy", bbc.state_dict(), manifest)
     return folder
 
