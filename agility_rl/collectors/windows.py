@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
-from scipy.signal import savgol_filter
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -148,6 +147,8 @@ def cut_windows(log: RobotLog, steps: int, *, skip: int = 0, noise: float = 0.0,
 
 def smooth(state: Tensor) -> Tensor:
     """Savitzky-Golay filter on every channel of measurements ``[T, 29]``; joint speeds are slopes of the positions."""
+    from scipy.signal import savgol_filter  # takes a second to import, which everyone else should not pay
+
     rows, degree = SMOOTHING
     smoothed = savgol_filter(state.numpy(), rows, degree, axis=0)
     position, velocity = (features.layout_slice(LAYOUT, name) for name in ("joint_position", "joint_velocity"))

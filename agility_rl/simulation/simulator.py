@@ -34,7 +34,7 @@ class Camera(Protocol):
 
     Example:
         >>> from agility_rl.simulation import make_simulator
-        >>> camera: Camera = make_simulator(1, num_threads=1).make_camera()
+        >>> camera: Camera = make_simulator(num_simulations=1, num_threads=1).make_camera()
         >>> camera.pitch
         tensor([0.])
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -20,11 +21,16 @@ from agility_rl.record.mcap_logger import read_scalars
 from agility_rl.training.checkpoint import RunCheckpoint
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "bbc_pretrain.py"
+ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1"}
+"""Tests run side by side; their processes must not fight for the cores."""
+
+
+Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def run(folder: Path, *options: str, check: bool = True) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(RECIPE), "smoke", "--runs", str(folder), *options]
-    return subprocess.run(command, capture_output=True, text=True, check=check, timeout=300)
+    return subprocess.run(command, capture_output=True, text=True, check=check, timeout=300, env=ONE_THREAD)
 
 
 @pytest.fixture(scope="module")
@@ -66,9 +72,9 @@ def test_init_from_starts_with_the_given_policy(finished: Path) -> None:
     assert Artifact.load(finished / "child" / "policy").manifest["network"]["hidden"] == [32, 32]
 
 
-def test_a_run_is_never_overwritten(finished: Path) -> None:
+def test_a_run_is_never_overwritten(finished: Path, command: Command) -> None:
     before = (finished / "whole" / "config.json").read_bytes()
-    result = run(finished, "--name", "whole", check=False)
+    result = command("bbc_pretrain", "smoke", "--runs", finished, "--name", "whole")
     assert result.returncode != 0
     assert "already holds a run" in result.stderr and "Traceback" not in result.stderr
     assert (finished / "whole" / "config.json").read_bytes() == before
@@ -76,7 +82,9 @@ def test_a_run_is_never_overwritten(finished: Path) -> None:
 
 def test_ctrl_c_saves_what_a_resume_goes_on_from(tmp_path: Path) -> None:
     command = [sys.executable, str(RECIPE), "smoke", "--runs", str(tmp_path), "--name", "cut", "--iterations", "100000"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ONE_THREAD
+    ) as process:
         deadline = time.monotonic() + 240.0
         try:
             while not (tmp_path / "cut" / "policy").is_dir():  # written with the first checkpoint
@@ -103,18 +111,20 @@ def test_ctrl_c_saves_what_a_resume_goes_on_from(tmp_path: Path) -> None:
         (("--resume", "nowhere"), "nothing to resume"),
     ],
 )
-def test_bad_options_give_one_clear_line(tmp_path: Path, options: tuple[str, ...], message: str) -> None:
-    result = run(tmp_path, *options, check=False)
+def test_bad_options_give_one_clear_line(
+    tmp_path: Path, command: Command, options: tuple[str, ...], message: str
+) -> None:
+    result = command("bbc_pretrain", "smoke", "--runs", tmp_path, *options)
     assert result.returncode == 2
     assert message in result.stderr
     assert "Traceback" not in result.stderr
 
 
-def test_a_truncated_checkpoint_is_refused_and_left_alone(finished: Path, tmp_path: Path) -> None:
+def test_a_truncated_checkpoint_is_refused_and_left_alone(tmp_path: Path, command: Command) -> None:
     run(tmp_path, "--name", "broken", "--iterations", "1")
     newest = sorted((tmp_path / "broken" / "checkpoints").glob("*.torchrl"))[-1]
     newest.write_bytes(newest.read_bytes()[:1000])
-    result = run(tmp_path, "--resume", str(tmp_path / "broken"), check=False)
+    result = command("bbc_pretrain", "smoke", "--resume", tmp_path / "broken")
     assert result.returncode == 2
     assert "damaged" in result.stderr and "Traceback" not in result.stderr
     assert newest.stat().st_size == 1000
@@ -128,11 +138,12 @@ def test_options_change_at_their_iterations(module: Callable[[str], ModuleType])
     assert [config.at(cfg, iteration).env.jump_weight for iteration in (2, 3)] == [6.0, 9.0]
 
 
-def test_what_cannot_change_in_a_run_is_refused(finished: Path) -> None:
-    result = run(finished, "--name", "changing", "--changes", "3", "ppo.gamma", "0.5", check=False)
+def test_what_cannot_change_in_a_run_is_refused(tmp_path: Path, command: Command) -> None:
+    options = ("--runs", tmp_path, "--name", "changing", "--changes", "3", "ppo.gamma", "0.5")
+    result = command("bbc_pretrain", "smoke", *options)
     assert result.returncode != 0 and "Traceback" not in result.stderr
     assert "ppo.gamma cannot change in a run, only ppo.entropy" in result.stderr
-    assert not (finished / "changing").exists()
+    assert not (tmp_path / "changing").exists()
 
 
 def test_a_gated_reward_is_paid_in_proportion_to_the_speed(module: Callable[[str], ModuleType]) -> None:

@@ -46,8 +46,8 @@ def test_an_evaluation_writes_numbers_tables_and_pictures(untrained: Path, recip
     assert "http://" not in text and "https://" not in text, "the page needs no network"
 
 
-def test_a_missing_folder_is_one_line(tmp_path: Path, recipe, evaluate: ModuleType) -> None:
-    result = recipe("evaluate", tmp_path / "nowhere")
+def test_a_missing_folder_is_one_line(tmp_path: Path, command, evaluate: ModuleType) -> None:
+    result = command("evaluate", tmp_path / "nowhere")
     assert result.returncode == 2 and "check the path" in result.stdout
     assert "Traceback" not in result.stderr
     with pytest.raises(FileNotFoundError, match=r"manifest\.json is missing"):

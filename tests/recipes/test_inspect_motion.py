@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -81,10 +79,8 @@ def test_impossible_options_and_empty_folders(recipe: ModuleType, screen: Consol
         recipe.main(recipe.Config(paths=(tmp_path,)), screen)
 
 
-def test_the_command_line_reports_a_missing_path_in_one_line(repository: Path, tmp_path: Path) -> None:
-    environment = os.environ | {"PYTHONPATH": str(repository), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "recipes/inspect_motion.py", str(tmp_path / "nowhere")]
-    result = subprocess.run(command, cwd=repository, env=environment, capture_output=True, text=True, timeout=120)
+def test_the_command_line_reports_a_missing_path_in_one_line(tmp_path: Path, command) -> None:
+    result = command("inspect_motion", tmp_path / "nowhere")
     assert result.returncode == 2
     assert "found nothing; check the path" in result.stdout
     assert "Traceback" not in result.stdout + result.stderr
