@@ -29,6 +29,10 @@ class EnvConfig:
     num_robots: int = 1024
     terrain: Literal["flat", "rough"] = "flat"
     """``flat`` or ``rough`` (method notes 4.5)."""
+    roughness: float = 0.05
+    """Half-width of the rough terrain's noise [m] (method notes, section 4.5)."""
+    steepness: float = 0.4
+    """Slope of its pyramids at difficulty 1; they are drawn at 0, 0.2 and 0.4 of it (method notes, section 4.5)."""
     randomize: bool = True
     push_interval: float | None = 8.0
     """Seconds (released code)."""
@@ -48,6 +52,8 @@ class EnvConfig:
     """First iteration and length of its fading: who walks can learn how a dog does."""
     progress_left: float = 0.0
     """Weight that is left of it; without any, a slow walk turns into standing."""
+    turn_weight: float = 0.0
+    """Weight of a reward for turning as fast as commanded that has a slope everywhere (ours)."""
     collision_weight: float = -10.0
     """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
     episode_length: float = 20.0

@@ -59,17 +59,21 @@ class Config:
     seconds: float = 20.0
     """Length of an episode."""
     motion: MotionConfig = field(default_factory=MotionConfig)
-    training: str = "cpu"
-    """Preset whose other settings hold: ``smoke``, ``cpu`` or ``paper``."""
+    training: str = "polish"
+    """Preset of ``bbc_pretrain.py`` whose other settings hold: ``smoke``, ``polish`` or ``paper``."""
+    anchor: float = 2.0
+    """How strongly the mean actions are held to those of the start: behaviours drift apart without it."""
 
 
 PRESETS = {
     "smoke": Config(training="smoke", iterations=3, episodes=1, seconds=2.0),
-    "cpu": Config(motion=bbc_presets.CPU.motion),
+    "cpu": Config(motion=bbc_presets.POLISH.motion),
     "paper": Config(training="paper", motion=bbc_presets.PAPER.motion),
 }
-ITERATIONS = {"smoke": 3, "cpu": 120, "paper": 10_000}
+ITERATIONS = {"smoke": 3, "polish": 120, "paper": 10_000}
 """The paper states no number of its own for the fine-tuning (method notes, section 11)."""
+LEARNING_RATE, DESIRED_KL = 1e-4, 0.006
+"""Small steps: a good policy has more to lose than to find."""
 
 
 def training(cfg: Config) -> bbc_config.Config:
@@ -99,12 +103,12 @@ def training(cfg: Config) -> bbc_config.Config:
         ppo=replace(
             base.ppo,
             critic_warm_up=min(20, (cfg.iterations or ITERATIONS[cfg.training]) // 2),
-            learning_rate=base.ppo.learning_rate / 3,
-            max_learning_rate=base.ppo.max_learning_rate / 3,
-            desired_kl=None if base.ppo.desired_kl is None else base.ppo.desired_kl / 2,
+            learning_rate=min(base.ppo.learning_rate, LEARNING_RATE),
+            max_learning_rate=min(base.ppo.max_learning_rate, 5.0 * LEARNING_RATE),
+            desired_kl=None if base.ppo.desired_kl is None else min(base.ppo.desired_kl, DESIRED_KL),
             hidden=hidden,
         ),
-        imitation=replace(base.imitation, cloning=0, information_ramp=(0, 1)),
+        imitation=replace(base.imitation, cloning=0, information_ramp=(0, 1), anchor=cfg.anchor),
     )
 
 

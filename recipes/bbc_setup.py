@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from bbc_cloning import Demonstrations
-from bbc_config import Config, MotionConfig
+from bbc_config import Config, EnvConfig, MotionConfig
 from held_fixed import INFERRED, privileged_loss
 from identified import load_simulator
 from tensordict import TensorDictBase
@@ -28,6 +28,7 @@ from agility_rl.envs.rewards import (
     RewardTerm,
     jump_height_peak,
     jump_height_window,
+    turn_progress,
     velocity_progress,
 )
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, thigh_contact
@@ -43,7 +44,7 @@ from agility_rl.modules import (
 )
 from agility_rl.motion import MotionDataset, load_clips
 from agility_rl.motion.gaits import synthetic_dataset_clips
-from agility_rl.simulation import rough_pyramids
+from agility_rl.simulation import HeightField, rough_pyramids
 from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.ppo import PPOUpdate
 from agility_rl.training.rollout import Rollout
@@ -102,6 +103,8 @@ def build(cfg: Config) -> Components:
     terms["jump_height"] = RewardTerm(cfg.env.jump_weight, jump)
     if cfg.env.progress_weight:
         terms["velocity_progress"] = RewardTerm(cfg.env.progress_weight, velocity_progress)
+    if cfg.env.turn_weight:
+        terms["turn_progress"] = RewardTerm(cfg.env.turn_weight, turn_progress)
     terms["collision"] = terms["collision"]._replace(weight=cfg.env.collision_weight)
     skills = torch.arange(len(BEHAVIOURS)).repeat_interleave(2000)
     reference = dataset.sample_states(skills, seeds.generator("reference"))
@@ -115,7 +118,7 @@ def build(cfg: Config) -> Components:
         simulator_options={
             "num_threads": cfg.env.num_threads,
             **model,
-            "terrain": rough_pyramids(seeds.generator("terrain")) if cfg.env.terrain == "rough" else None,
+            "terrain": make_terrain(cfg.env, seeds.generator("terrain")),
         },
         reference=reference.set("skill", skills),
         rewards=terms,
@@ -245,6 +248,13 @@ def build(cfg: Config) -> Components:
             fused=True,
         ),
     )
+
+
+def make_terrain(cfg: EnvConfig, generator: torch.Generator) -> HeightField | None:
+    """The height field, or nothing for flat ground."""
+    if cfg.terrain == "flat":
+        return None
+    return rough_pyramids(generator, noise=cfg.roughness, slope=cfg.steepness)
 
 
 def load_motion(cfg: MotionConfig, seed: int) -> MotionDataset:

@@ -97,6 +97,12 @@ class CourseLayout:
             rows = mask.view(-1, *(1,) * (value.ndim - 1))
             setattr(self, name, torch.where(rows, value, getattr(self, name)))
 
+    @property
+    def owners(self) -> Tensor:
+        """Obstacle that each of :attr:`pieces` belongs to, int64 ``[P]``; -1 for walls."""
+        walls = torch.full((len(self.pieces) - len(self._owner),), -1)
+        return torch.cat((self._owner, walls))
+
     def poses(self) -> tuple[Tensor, Tensor, Tensor]:
         """Positions ``[N, P, 3]``, quaternions ``[N, P, 4]`` and hinge angles ``[N, H]`` of :attr:`pieces`."""
         n = len(self.yaw)

@@ -60,6 +60,15 @@ def velocity_progress(state: LocomotionState) -> Tensor:
     return (1.0 - (along - speed).abs() / speed.clamp(min=SLOW)).clamp(min=-1.0)
 
 
+def turn_progress(state: LocomotionState) -> Tensor:
+    """``max(1 - |w - w*| / 1 rad/s, -1)``, w the mean turn rate of the last half second.
+
+    Ours: the exponential of :func:`yaw_rate` has no slope where a robot goes straight and should turn by 1 rad/s, and
+    the trunk of a galloping dog yaws within its stride.
+    """
+    return (1.0 - (state.mean_yaw_rate - state.command[:, 2]).abs()).clamp(min=-1.0)
+
+
 def jump_height_window(state: LocomotionState) -> Tensor:
     """10 while jumping and within 5 cm of the commanded height (released code)."""
     near = (state.command[:, 3] - state.root_height[:, 0]).abs() < 0.05

@@ -16,11 +16,12 @@ from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator
 
 STRIDE = 0.5
-"""Time constant over which a robot's velocity is averaged [s]: a dog does not walk at a constant speed."""
+"""Time constant over which a robot's velocities are averaged [s]: a dog does not walk at a constant speed."""
 CLEARANCE = 0.005
 """Height added at a reset, so that no foot starts in the ground [m]."""
 
-_BUFFERS = ("action", "torque", "joint_velocity", "mean_velocity", "heights", "privileged", "stiffness", "damping")
+_BUFFERS = ("action", "torque", "joint_velocity", "mean_velocity", "mean_yaw_rate", "heights", "privileged")
+_BUFFERS += ("stiffness", "damping")
 
 
 class Robots:
@@ -56,7 +57,7 @@ class Robots:
         self._default_pose = torch.tensor(constants.DEFAULT_POSE)
         self._action_scale = torch.tensor(constants.ACTION_SCALE)
         self.action, self.torque, self.joint_velocity = (torch.zeros(n, constants.NUM_JOINTS) for _ in range(3))
-        self.mean_velocity = torch.zeros(n, 3)
+        self.mean_velocity, self.mean_yaw_rate = torch.zeros(n, 3), torch.zeros(n)
         self.heights = torch.zeros(n, round(features.PEAK_WINDOW / self.dt))
         fields, self.privileged = sample_parameters(n, NOMINAL, generator)
         self.stiffness, self.damping = fields["stiffness"], fields["damping"]
@@ -66,6 +67,7 @@ class Robots:
         self.simulator.step(self._default_pose + self._action_scale * action)
         self.heights = torch.cat((self.heights[:, 1:], self._height()), -1)
         self.mean_velocity = torch.lerp(self.mean_velocity, self._velocity(), self.dt / STRIDE)
+        self.mean_yaw_rate = torch.lerp(self.mean_yaw_rate, self._yaw_rate(), self.dt / STRIDE)
 
     def remember(self, state: LocomotionState) -> None:
         """Keep of a step's state what the next one compares with."""
@@ -78,6 +80,7 @@ class Robots:
         self.joint_velocity = torch.where(row, self.simulator.joint_velocity, self.joint_velocity)
         self.heights = torch.where(row, self._height(), self.heights)
         self.mean_velocity = torch.where(row, self._velocity(), self.mean_velocity)
+        self.mean_yaw_rate = torch.where(mask, self._yaw_rate(), self.mean_yaw_rate)
         state = self.state(self.action, commands)
         self.torque = torch.where(row, state.torque, self.torque)
         return state
@@ -98,6 +101,9 @@ class Robots:
     def _velocity(self) -> Tensor:
         return rotations.rotate_inverse(self.simulator.root_quaternion, self.simulator.root_linear_velocity)
 
+    def _yaw_rate(self) -> Tensor:
+        return self.simulator.root_angular_velocity[:, 2]
+
     def state(self, action: Tensor, commands: CommandSampler) -> LocomotionState:
         """The present, as the terms of an environment see it."""
         simulator = self.simulator
@@ -112,6 +118,7 @@ class Robots:
             yaw=yaw,
             linear_velocity=self._velocity(),
             mean_velocity=self.mean_velocity,
+            mean_yaw_rate=self.mean_yaw_rate,
             angular_velocity=simulator.root_angular_velocity,
             joint_position=simulator.joint_position,
             joint_velocity=simulator.joint_velocity,

@@ -18,6 +18,7 @@ class LocomotionState:
         yaw: ``[N]`` [rad].
         linear_velocity: ``[N, 3]`` [m/s], base frame.
         mean_velocity: ``[N, 3]`` [m/s], base frame, averaged over the last 0.5 s with exponential weights.
+        mean_yaw_rate: ``[N]`` [rad/s], about the base's z axis, averaged likewise.
         angular_velocity: ``[N, 3]`` [rad/s], base frame.
         joint_position: ``[N, 12]`` [rad].
         joint_velocity: ``[N, 12]`` [rad/s].
@@ -44,6 +45,7 @@ class LocomotionState:
     yaw: Tensor
     linear_velocity: Tensor
     mean_velocity: Tensor
+    mean_yaw_rate: Tensor
     angular_velocity: Tensor
     joint_position: Tensor
     joint_velocity: Tensor

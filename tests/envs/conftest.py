@@ -45,7 +45,8 @@ def neutral() -> Callable[..., LocomotionState]:
         )
         fields: dict[str, Any] = {
             "root_height": torch.full((n, 1), constants.STANDING_HEIGHT),
-            **{name: torch.zeros(n) for name in ("roll", "pitch", "yaw", "trunk_contact", "peak_height")},
+            **{name: torch.zeros(n) for name in ("roll", "pitch", "yaw", "mean_yaw_rate")},
+            **{name: torch.zeros(n) for name in ("trunk_contact", "peak_height")},
             **{name: torch.zeros(n, 3) for name in ("linear_velocity", "mean_velocity", "angular_velocity")},
             "joint_position": pose,
             **{name: torch.zeros(n, 12) for name in joints},

@@ -133,3 +133,11 @@ def test_two_obstacles_of_a_type_are_two() -> None:
     assert (layout.lift[:, 0] != layout.lift[:, 1]).all()
     field = Course("open", (9.0, 9.0), (Slot("a_frame", (4.0, 4.0), jitter=Jitter()),), wall_height=None)
     assert [piece.name for piece in drawn(field, 1).pieces] == ["0_a_frame_boards"]
+
+
+def test_every_piece_has_its_obstacle_and_walls_have_none() -> None:
+    layout = drawn(COURSES["full"], 1)
+    for piece, owner in zip(layout.pieces, layout.owners.tolist(), strict=True):
+        expected = "wall" if owner < 0 else f"{owner}_{layout.kinds[owner].name}"
+        assert piece.name.startswith(f"{expected}_"), piece.name
+    assert set(layout.owners.tolist()) == {-1, 0, 1, 2, 3, 4, 5}

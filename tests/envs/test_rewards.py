@@ -35,6 +35,7 @@ def pose(**values: float) -> Tensor:
 
 
 JUMPING = torch.tensor([True])
+TURN = torch.tensor([[0.0, 0.0, -0.8, 0.0, 0.3]])
 CASES: list[tuple[str, dict[str, Any], float]] = [
     # errors 0.5 and 0.2 m/s: exp(-(0.25 + 0.04) / 0.25)
     ("linear_velocity", {"command": COMMAND, "linear_velocity": torch.tensor([[0.5, 0.0, 9.0]])}, 0.3134862),
@@ -45,6 +46,9 @@ CASES: list[tuple[str, dict[str, Any], float]] = [
     ("velocity_progress", {"command": 0.05 * COMMAND}, 1.0 - 0.05 * 1.04**0.5 / 0.1),
     ("velocity_progress", {"command": COMMAND, "mean_velocity": torch.tensor([[-9.0, 0.0, 0.0]])}, -1.0),
     ("velocity_progress", {"command": COMMAND}, 0.0),
+    ("turn_progress", {"command": TURN, "mean_yaw_rate": torch.tensor([-0.3])}, 0.5),
+    ("turn_progress", {"command": TURN, "mean_yaw_rate": torch.tensor([-1.0])}, 0.8),
+    ("turn_progress", {"command": TURN, "mean_yaw_rate": torch.tensor([4.0])}, -1.0),
     ("velocity_progress", {"command": 0.0 * COMMAND}, 1.0),
     # error 0.5 rad/s: exp(-1)
     ("yaw_rate", {"command": COMMAND, "angular_velocity": torch.tensor([[9.0, 9.0, 0.5]])}, 0.3678794),

@@ -47,15 +47,22 @@ def test_heights_count_from_the_given_ground_and_peaks_last_their_window() -> No
 def test_the_mean_velocity_follows_with_its_time_constant_and_starts_with_the_robot() -> None:
     robots, commands = build(1)
     robots.begin(torch.ones(1, dtype=torch.bool), commands)
-    mean = robots.state(robots.action, commands).linear_velocity
+    robots.simulator.push(torch.ones(1, dtype=torch.bool), torch.tensor([[1.0, 0.5]]))
+    robots.begin(torch.ones(1, dtype=torch.bool), commands)
+    state = robots.state(robots.action, commands)
+    mean, turn = state.linear_velocity, state.angular_velocity[:, 2]
     for _ in range(10):
-        robots.step(torch.zeros(1, 12))
+        robots.step(0.5 * torch.eye(12)[:1])
         state = robots.state(torch.zeros(1, 12), commands)
         mean = mean + 0.02 / STRIDE * (state.linear_velocity - mean)
+        turn = turn + 0.02 / STRIDE * (state.angular_velocity[:, 2] - turn)
         torch.testing.assert_close(state.mean_velocity, mean)
+        torch.testing.assert_close(state.mean_yaw_rate, turn)
+    assert turn.abs() > 1e-3
     robots.begin(torch.ones(1, dtype=torch.bool), commands)
     state = robots.state(robots.action, commands)
     assert torch.equal(state.mean_velocity, state.linear_velocity)
+    assert torch.equal(state.mean_yaw_rate, state.angular_velocity[:, 2])
 
 
 def test_randomising_some_leaves_the_others() -> None:
