@@ -27,17 +27,16 @@ from bbc_setup import ANCHORED, Components, build, policy_folder, save_policy
 from held_fixed import infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from training_run import run
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.losses import functional
-from agility_rl.record import MCAPLogger
 from agility_rl.training import cli
-from agility_rl.training.display import Display
 
-HEADLINE = ("time/minutes", "reward/imitation", "reward/task", "accuracy_expert", "accuracy_policy", "kl")
-HEADLINE += (
+HEADLINE: tuple[str, ...] = (
+    *("time/minutes", "reward/imitation", "reward/task", "accuracy_expert", "accuracy_policy", "kl"),
     "falls_per_minute",
     *(f"style/{name}" for name in BEHAVIOURS),
     *(f"recovery/{name}" for name in BEHAVIOURS),
@@ -186,37 +185,25 @@ def train(cfg: Config) -> Path:
         cfg = replace(own, resume=cfg.resume, iterations=cfg.iterations, max_minutes=cfg.max_minutes)
     check_changes(cfg)
     parts = build(cfg)
-    folder = cli.start_run(cfg, cfg.resume or cfg.runs / cfg.name, resume=cfg.resume is not None, recipe="bbc_pretrain")
-    progress = {"iteration": 0, "minutes": 0.0}
-    checkpoint = parts.checkpoint(folder / "checkpoints", progress)
-    if cfg.resume:
-        checkpoint.load()
-    else:
+
+    def begin() -> None:
         warm_up_predictor(parts, cfg.imitation)
         if cfg.init_from:
             parts.bbc.load_state_dict(Artifact.load(policy_folder(cfg.init_from), kind="bbc").state)
         elif cfg.imitation.cloning:
             error = clone_behaviour(parts.bbc, parts.demonstrations, cfg.imitation.cloning)
             print(f"cloned {len(parts.dataset.labelled_clips)} labelled clips: squared action error {error:.3f}")
-    logger = MCAPLogger(folder.name, folder.parent, resume=cfg.resume is not None)
-    start = time.monotonic() - 60.0 * progress["minutes"]
-    with Display("bbc_pretrain", cfg.iterations, headline=HEADLINE) as display, cli.interruptible() as interrupted:
-        while progress["iteration"] < cfg.iterations and not interrupted():
-            metrics = iterate(parts, cfg, progress["iteration"])
-            progress["iteration"] += 1
-            progress["minutes"] = metrics["time/minutes"] = (time.monotonic() - start) / 60.0
-            logger.log_metrics(metrics, step=progress["iteration"])
-            display.update(progress["iteration"], metrics)
-            if progress["iteration"] % cfg.checkpoint_every == 0:
-                checkpoint.save(progress["iteration"])
-                save_policy(parts, cfg, folder)
-            if cfg.max_minutes is not None and progress["minutes"] >= cfg.max_minutes:
-                break
-    checkpoint.save(progress["iteration"])
-    save_policy(parts, cfg, folder)
-    logger.close()
+
+    folder = run(
+        "bbc_pretrain",
+        cfg,
+        checkpoint=parts.checkpoint,
+        begin=begin,
+        iterate=lambda iteration: iterate(parts, cfg, iteration),
+        save_policy=lambda folder: save_policy(parts, cfg, folder),
+        headline=HEADLINE,
+    )
     parts.env.close()
-    print(f"saved {folder}")
     return folder
 
 

@@ -1,16 +1,18 @@
 """Measure a Task-Specific Controller on courses: does the robot pass them, how fast, and with which behaviours?
 
-In:  a run folder of ``tsc_teacher.py`` or its ``policy/`` folder; or no teacher but a script, one behaviour at one
-     speed that turns towards the way-points: a baseline that needs only a Basic Behaviour Controller.
+In:  a run folder of ``tsc_teacher.py`` or ``tsc_student.py``, or its ``policy/`` folder; or a script, one behaviour at
+     one speed that turns towards the way-points: a baseline that needs only a Basic Behaviour Controller.
 Out: tables on the screen, ``RUN/course_evaluation.json``, ``RUN/figures/course_*.png``; an earlier one is replaced.
 
     python recipes/evaluate_course.py runs/my_teacher                    # the course that it was trained on
     python recipes/evaluate_course.py runs/my_teacher --course targets   # full, each obstacle alone, box, hurdles
     python recipes/evaluate_course.py --script trot:1.2 --course each --episodes 50
+    python recipes/evaluate_course.py runs/my_student --disturbance all  # rectangles, noise, ..., a late camera
 
 Courses: a preset, a .toml or .json file, ``each`` for every obstacle of the challenge alone, or ``targets``.
 Every episode has a course of its own at the released difficulty, starts before the first obstacle, and is driven by the
-deterministic deployable teacher (history encoder) with the frozen BBC, without noise on its commands.
+deterministic deployable teacher (history encoder) or student (depth images, its own memory and headings), with the
+frozen BBC and without noise on its commands. Several students, with and without BYOL: ``compare_students.py``.
 """
 
 from __future__ import annotations
@@ -18,13 +20,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 from course_judgement import behaviour_seconds, print_courses, summarise, targets
 from course_pictures import typical, view
-from course_rollouts import Decider, Episode, load_script, load_teacher, record_episodes, shares
+from course_rollouts import Episode, record_episodes, shares
+from deciders import Decider, load_decider, load_script
+from disturbances import DISTURBANCES, Disturbance, chosen
 from judgement import to_json
 from rich.console import Console
 from rich.progress import Progress
@@ -54,19 +59,23 @@ RANDOMIZATIONS = {
 @dataclass(frozen=True)
 class Config:
     run: Annotated[Path | None, tyro.conf.Positional] = None
-    """Run or artifact folder of a teacher."""
+    """Run or artifact folder of a teacher or student."""
     script: str | None = None
-    """BEHAVIOUR:SPEED, such as trot:1.2 [m/s], in place of a teacher."""
+    """BEHAVIOUR:SPEED, such as trot:1.2 [m/s], in place of it."""
     bbc: Path | None = None
     """Folder of the Basic Behaviour Controller: that of the training by default, for a script the pretrained one."""
     course: tuple[str, ...] = ()
-    """Courses; by default the one that the teacher was trained on, for a script ``full``."""
+    """Courses; by default the one that it was trained on, for a script ``full``."""
+    disturbance: tuple[str, ...] = ("none",)
+    """Of a student's camera: none, rectangles, noise, blur, dropout, late_1, late_2, pitch; ``all`` for each."""
+    strength: int = 1
+    """How many times images are disturbed."""
     episodes: int = 500
     """Episodes of each course."""
     robots: int = 125
     """Most robots simulated at once; each of them runs its share of the episodes from start to end."""
     behaviours: tuple[str, ...] | None = None
-    """Behaviours that the teacher may choose, by default all that it was trained with."""
+    """Behaviours that it may choose, by default all that it was trained with."""
     goal_radius: float = 0.45
     """Distance at which a way-point is reached [m]; the release trains with 0.4 and evaluates with 0.45."""
     episode_length: float = 40.0
@@ -85,8 +94,14 @@ class Config:
     """Folder of the results; by default the run, for a script ``runs/script_BEHAVIOUR_SPEED``."""
 
 
-def simulate(course: Course, decider: Decider, config: Config, progress: Callable[[], object]) -> list[Episode]:
-    """All episodes of one course."""
+def simulate(
+    course: Course,
+    decider: Decider,
+    config: Config,
+    progress: Callable[[], object] = lambda: None,
+    disturbance: Disturbance = DISTURBANCES["none"],
+) -> list[Episode]:
+    """All episodes of one course under one disturbance."""
     quota = shares(config.episodes, config.robots)
     env = AgilityEnv(
         len(quota),
@@ -103,7 +118,7 @@ def simulate(course: Course, decider: Decider, config: Config, progress: Callabl
         push_interval=config.push_interval,
         seed=config.seed,
     )
-    episodes = record_episodes(env, decider, quota, progress)
+    episodes = record_episodes(env, decider, quota, progress, disturbance, config.seed)
     env.close()
     return episodes
 
@@ -127,40 +142,50 @@ def check(config: Config) -> None:
     if config.push_interval is not None and config.push_interval < CONTROL_DT:
         raise ValueError(f"expected --push-interval of at least {CONTROL_DT} s, got {config.push_interval}")
     if (config.run is None) == (config.script is None):
-        raise ValueError("expected either the folder of a teacher or --script BEHAVIOUR:SPEED, such as trot:1.2")
+        raise ValueError(
+            "expected either the folder of a teacher or student, or --script BEHAVIOUR:SPEED, such as trot:1.2"
+        )
     if config.script is not None and config.behaviours is not None:
-        raise ValueError("--behaviours limits a teacher; a script has one behaviour already")
+        raise ValueError("--behaviours limits a teacher or student; a script has one behaviour already")
 
 
 def evaluate(config: Config, console: Console) -> dict[str, Any]:
     """The whole evaluation; writes it and returns it."""
     check(config)
+    disturbances = chosen(config.disturbance, config.strength)
     begin = time.monotonic()
     if config.run is not None:
-        decider = load_teacher(config.run, config.bbc, config.behaviours)
+        decider = load_decider(config.run, config.bbc, config.behaviours)
     else:
         decider = load_script(str(config.script), config.bbc)
-    courses = {name: course_of(name) for name in names(config, decider)}
+    if decider.student is None and set(disturbances) != {"none"}:
+        raise ValueError(f"--disturbance: {decider.name} has no camera to disturb; give a student")
+    cells = [(name, key) for name in names(config, decider) for key in disturbances]
+    courses = {name: course_of(name) for name, _ in cells}
     output = config.output or decider.run or Path("runs") / decider.name
     found: dict[str, Any] = {}
     use: dict[str, Tensor] = {}
     with Progress(console=console, transient=True) as bar:
-        for name, course in courses.items():
-            task = bar.add_task(name, total=config.episodes)
-            episodes = simulate(course, decider, config, lambda: bar.advance(task))  # noqa: B023 (called at once)
-            found[name] = summarise(course, episodes)
+        for name, key in cells:
+            course, label, file = courses[name], name, Path(name).stem
+            if key != "none":
+                label, file = f"{name}, {disturbances[key].label}", f"{file}_{key}"
+            task = bar.add_task(label, total=config.episodes)
+            episodes = simulate(course, decider, config, partial(bar.advance, task), disturbances[key])
+            found[label] = summarise(course, episodes)
             figure = plan_view([view(course, episode, config.goal_radius) for episode in typical(episodes)])
-            save_figure(figure, output / "figures" / f"course_{Path(name).stem}.png")
+            save_figure(figure, output / "figures" / f"course_{file}.png")
             seconds = behaviour_seconds(episodes)
             for index, obstacle in enumerate(OBSTACLES):
                 if seconds[index].sum() > 0.0:
-                    label = obstacle if obstacle == name else f"{Path(name).stem}: {obstacle}"
-                    use[label.replace("_", " ")] = seconds[index]
+                    row = obstacle if obstacle == label else f"{file}: {obstacle}"
+                    use[row.replace("_", " ")] = seconds[index]
     save_figure(behaviour_use(use), output / "figures" / "course_behaviours.png")
     result = {
         "format": "agility_rl.course_evaluation",
         "format_version": 1,
         "run": decider.name,
+        "kind": decider.kind,
         "weights": decider.weights,
         "bbc": decider.controller.artifact.manifest["weights"]["sha256"],
         "decision_period": decider.decision_steps * CONTROL_DT,
@@ -173,8 +198,9 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
     }
     cli.write_json(output / "course_evaluation.json", to_json(result))
     print_courses(result, console)
-    where = output / "course_evaluation.json"
-    console.print(f"{where} and figures written after {result['seconds']:.0f} s", highlight=False)
+    console.print(
+        f"{output / 'course_evaluation.json'} and figures written after {result['seconds']:.0f} s", highlight=False
+    )
     return result
 
 

@@ -11,12 +11,8 @@ from typing import Literal
 
 
 @dataclass(frozen=True)
-class EnvConfig:
-    course: str = "full"
-    """Name of a preset course (``full``, ``tunnel``, ``box``, ``hurdles``, ...), or a course file."""
+class RobotsConfig:
     num_robots: int = 512
-    decision_steps: int = 1
-    """Control steps of a decision; 1 decides at 50 Hz (method notes, section 5.1)."""
     randomize: bool = True
     """Friction, mass, centre of mass and one step of action delay (method notes, section 5.11)."""
     push_interval: float | None = 8.0
@@ -26,6 +22,14 @@ class EnvConfig:
     episode_length: float = 40.0
     """Seconds (method notes, section 5.6)."""
     num_threads: int | None = None
+
+
+@dataclass(frozen=True)
+class EnvConfig(RobotsConfig):
+    course: str = "full"
+    """Name of a preset course (``full``, ``tunnel``, ``box``, ``hurdles``, ...), or a course file."""
+    decision_steps: int = 1
+    """Control steps of a decision; 1 decides at 50 Hz (method notes, section 5.1)."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import KLAdaptiveLR
 from torchrl.objectives.value import GAE
-from tsc_config import Config, CurriculumConfig
+from tsc_config import Config, CurriculumConfig, RobotsConfig
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS, skill_index
@@ -58,6 +58,12 @@ class Curriculum:
     failed: Tensor = field(default_factory=lambda: torch.ones(len(OBSTACLES)))
     successes: int = 0
     episodes: int = 0
+
+    @classmethod
+    def start(cls, cfg: CurriculumConfig, env: AgilityEnv) -> Curriculum:
+        """Where a run on a course begins."""
+        most = len(env.arena.layout.kinds)
+        return cls(cfg, cfg.difficulty, min(cfg.obstacles, most), most)
 
     def update(self, passed: Tensor, failed: Tensor, successes: int, episodes: int) -> None:
         """Count what an iteration has finished, and take a step if it is time."""
@@ -125,7 +131,14 @@ def build(cfg: Config) -> Components:
     seeds, ppo = seed_everything(cfg.seed), cfg.ppo
     controller = load_controller(cfg.bbc)
     discriminator, offsets = load_discriminator(controller.run, cfg.reward.imitation > 0.0)
-    env = make_env(cfg, controller, seed=seeds.integer("environment"), motion_offsets=offsets)
+    env = make_env(
+        cfg.env,
+        controller,
+        cfg.env.course,
+        cfg.env.decision_steps,
+        seed=seeds.integer("environment"),
+        motion_offsets=offsets,
+    )
     allowed = None if set(cfg.behaviours) == set(BEHAVIOURS) else sorted(skill_index(name) for name in cfg.behaviours)
     teacher = Teacher(len(OBSTACLES), ppo.hidden, ppo.initial_std, ppo.min_std, allowed)
     teacher.estimator.load_state_dict(controller.bbc.estimator.state_dict())  # method notes, section 5.3
@@ -164,12 +177,7 @@ def build(cfg: Config) -> Components:
         teacher=teacher,
         critic=critic,
         discriminator=discriminator,
-        curriculum=Curriculum(
-            cfg.curriculum,
-            cfg.curriculum.difficulty,
-            min(cfg.curriculum.obstacles, len(env.arena.layout.kinds)),
-            len(env.arena.layout.kinds),
-        ),
+        curriculum=Curriculum.start(cfg.curriculum, env),
         rollout=Rollout(
             env,
             ppo.steps,
@@ -198,19 +206,20 @@ def build(cfg: Config) -> Components:
     )
 
 
-def make_env(cfg: Config, controller: Controller, **options: Any) -> AgilityEnv:
-    """The course with the frozen controller in it."""
-    env = cfg.env
+def make_env(
+    robots: RobotsConfig, controller: Controller, course: str, decision_steps: int, **options: Any
+) -> AgilityEnv:
+    """A course for training, with the frozen controller in it."""
     return AgilityEnv(
-        env.num_robots,
+        robots.num_robots,
         frozen(controller),
-        course_of(env.course),
-        simulator_options={"num_threads": env.num_threads, "friction_loss": controller.friction_loss},
-        decision_steps=env.decision_steps,
-        command_noise=env.command_noise,
-        randomization=COURSE_RANDOMIZATION if env.randomize else None,
-        episode_length=env.episode_length,
-        push_interval=env.push_interval,
+        course_of(course),
+        simulator_options={"num_threads": robots.num_threads, "friction_loss": controller.friction_loss},
+        decision_steps=decision_steps,
+        command_noise=robots.command_noise,
+        randomization=COURSE_RANDOMIZATION if robots.randomize else None,
+        episode_length=robots.episode_length,
+        push_interval=robots.push_interval,
         **options,
     )
 

@@ -20,9 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from course_metrics import judge, set_course
 from held_fixed import infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from training_run import run
 from tsc_config import PRESETS, Config
 from tsc_setup import Components, build, save_policy
 
@@ -31,11 +33,16 @@ from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.losses import functional
-from agility_rl.record import MCAPLogger
 from agility_rl.training import cli
-from agility_rl.training.display import Display
 
-HEADLINE = ("time/minutes", "success", "episodes", "curriculum/difficulty", "curriculum/obstacles", "falls_per_minute")
+HEADLINE: tuple[str, ...] = (
+    "time/minutes",
+    "success",
+    "episodes",
+    "curriculum/difficulty",
+    "curriculum/obstacles",
+    "falls_per_minute",
+)
 HEADLINE += tuple(f"success/{name}" for name in OBSTACLES)
 HEADLINE += tuple(f"use/{name}" for name in BEHAVIOURS)
 
@@ -51,36 +58,6 @@ def add_rewards(parts: Components, cfg: Config, batch: TensorDictBase) -> dict[s
         rewards["imitation"] = cfg.reward.imitation * seconds * style.reshape(*batch.shape, 1)
     batch["next", "reward"] = torch.stack(tuple(rewards.values())).sum(0)
     return {f"reward/{name}": value.mean() for name, value in rewards.items()}
-
-
-def judge(parts: Components, batch: TensorDictBase) -> dict[str, Tensor | float]:
-    """Success of the episodes that ended, of every obstacle, and what was chosen before it; feeds the curriculum."""
-    after, outcome = batch["next"], batch["next", keys.OUTCOME]
-    done = after["done"][..., 0]
-    episodes, successes = int(done.sum()), int((outcome["success"][..., 0] & done).sum())
-    passed = outcome["passed"].flatten(0, 1).sum(0).float()
-    failed = (outcome["failed"] | outcome["bypassed"]).flatten(0, 1).sum(0).float()
-    parts.curriculum.update(passed, failed, successes, episodes)
-    rate = parts.curriculum.passed / (parts.curriculum.passed + parts.curriculum.failed)
-    metrics: dict[str, Tensor | float] = {"episodes": float(episodes)}
-    if episodes:
-        metrics["success"] = successes / episodes
-    chosen = torch.nn.functional.one_hot(batch[keys.ACTION, keys.BEHAVIOUR].flatten(), len(BEHAVIOURS)).float()
-    before = batch[keys.OBSTACLE].flatten(0, 1)
-    present = parts.env.arena.types.any(0).tolist()
-    for index, name in enumerate(OBSTACLES):
-        if not present[index]:
-            continue
-        metrics[f"success/{name}"] = rate[index]
-        shares = chosen[before[:, index] > 0.5].mean(0)
-        metrics |= {f"use_{name}/{b}": share for b, share in zip(BEHAVIOURS, shares, strict=True)}
-    metrics |= {f"use/{b}": share for b, share in zip(BEHAVIOURS, chosen.mean(0), strict=True)}
-    metrics |= {f"cause/{name}": value.float().sum() for name, value in after[keys.TERMINATIONS].items()}
-    seconds = done.numel() * parts.env.dt * parts.env.decision_steps
-    metrics["falls_per_minute"] = after["terminated"].sum() * 60.0 / seconds
-    metrics["curriculum/difficulty"] = parts.curriculum.difficulty
-    metrics["curriculum/obstacles"] = float(parts.curriculum.obstacles)
-    return metrics
 
 
 def update_adaptation(parts: Components, minibatches: int, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -105,17 +82,12 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         now = time.perf_counter()
         times[f"time/{name}"], clock = now - clock, now
 
-    curriculum = parts.curriculum
-    parts.env.set_curriculum(
-        difficulty=curriculum.difficulty,
-        obstacles=curriculum.obstacles,
-        start_weights=curriculum.start_weights(parts.env.arena.types),
-    )
+    set_course(parts.env, parts.curriculum)
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     policy = parts.teacher.deployable_policy() if with_history else parts.teacher.privileged_policy()
     batch = parts.rollout.collect(policy)
     lap("collect")
-    metrics: dict[str, Any] = judge(parts, batch)
+    metrics: dict[str, Any] = judge(parts.env, parts.curriculum, batch)
     metrics |= add_rewards(parts, cfg, batch)
     weight = functional.linear_ramp(iteration, *cfg.adaptation.privileged_ramp, cfg.adaptation.privileged)
     parts.privileged_loss.privileged = weight  # the loss applies its own coefficient
@@ -145,34 +117,22 @@ def train(cfg: Config) -> Path:
     if unknown := sorted(set(cfg.behaviours) - set(BEHAVIOURS)):
         raise ValueError(f"--behaviours: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
     parts = build(cfg)
-    folder = cfg.resume or cfg.runs / cfg.name
-    folder = cli.start_run(cfg, folder, resume=cfg.resume is not None, recipe="tsc_teacher")
-    progress = {"iteration": 0, "minutes": 0.0}
-    checkpoint = parts.checkpoint(folder / "checkpoints", progress)
-    if cfg.resume is not None:
-        checkpoint.load()
-    elif cfg.init_from is not None:
-        source = cfg.init_from / "policy" if (cfg.init_from / "policy").is_dir() else cfg.init_from
-        parts.teacher.load_state_dict(Artifact.load(source, kind="teacher").state)
-    logger = MCAPLogger(folder.name, folder.parent, resume=cfg.resume is not None)
-    start = time.monotonic() - 60.0 * progress["minutes"]
-    with Display("tsc_teacher", cfg.iterations, headline=HEADLINE) as display, cli.interruptible() as interrupted:
-        while progress["iteration"] < cfg.iterations and not interrupted():
-            metrics = iterate(parts, cfg, int(progress["iteration"]))
-            progress["iteration"] += 1
-            progress["minutes"] = metrics["time/minutes"] = (time.monotonic() - start) / 60.0
-            logger.log_metrics(metrics, step=int(progress["iteration"]))
-            display.update(int(progress["iteration"]), metrics)
-            if progress["iteration"] % cfg.checkpoint_every == 0:
-                checkpoint.save(int(progress["iteration"]))
-                save_policy(parts, cfg, folder)
-            if cfg.max_minutes is not None and progress["minutes"] >= cfg.max_minutes:
-                break
-    checkpoint.save(int(progress["iteration"]))
-    save_policy(parts, cfg, folder)
-    logger.close()
+
+    def begin() -> None:
+        if cfg.init_from is not None:
+            source = cfg.init_from / "policy" if (cfg.init_from / "policy").is_dir() else cfg.init_from
+            parts.teacher.load_state_dict(Artifact.load(source, kind="teacher").state)
+
+    folder = run(
+        "tsc_teacher",
+        cfg,
+        checkpoint=parts.checkpoint,
+        begin=begin,
+        iterate=lambda iteration: iterate(parts, cfg, iteration),
+        save_policy=lambda folder: save_policy(parts, cfg, folder),
+        headline=HEADLINE,
+    )
     parts.env.close()
-    print(f"saved {folder}")
     return folder
 
 

@@ -58,6 +58,7 @@ class RecurrentStudent(nn.Module):
         min_std: its floor.
         allowed: indices of the behaviours that it may choose; ``None`` for all.
         memory: units of the GRU.
+        encoder_hidden: units of the depth encoder's hidden linear layer.
         heading_gate: see :data:`HEADING_GATE`.
 
     Example:
@@ -79,6 +80,7 @@ class RecurrentStudent(nn.Module):
         allowed: Sequence[int] | None = None,
         *,
         memory: int = 512,
+        encoder_hidden: int = 128,
         heading_gate: float = HEADING_GATE,
     ) -> None:
         super().__init__()
@@ -89,9 +91,10 @@ class RecurrentStudent(nn.Module):
             "min_std": min_std,
             "allowed": None if allowed is None else list(allowed),
             "memory": memory,
+            "encoder_hidden": encoder_hidden,
             "heading_gate": heading_gate,
         }
-        self.depth_encoder = DepthEncoder()
+        self.depth_encoder = DepthEncoder(hidden=encoder_hidden)
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
         self.memory = Memory(32 + features.NUM_PROPRIOCEPTION, memory, num_obstacles)

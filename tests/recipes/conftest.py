@@ -1,4 +1,4 @@
-"""A tiny run: the artifact of an untrained controller."""
+"""Tiny runs: artifacts of an untrained controller, teacher and student."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import torch
 
 from agility_rl.deploy.artifact import Artifact, build_manifest
+from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import features
-from agility_rl.modules import BasicBehaviourController
+from agility_rl.modules import BasicBehaviourController, RecurrentStudent, Teacher
 
 
 @pytest.fixture
@@ -26,6 +28,37 @@ def untrained(tmp_path: Path) -> Path:
     manifest |= {"network": bbc.settings, "prior": [0.6, 0.2, 0.1, 0.06, 0.04]}
     Artifact.save(tmp_path / "run" / "policy", bbc.state_dict(), manifest)
     return tmp_path / "run"
+
+
+@pytest.fixture
+def untrained_teacher(untrained: Path, tmp_path: Path) -> Path:
+    """Run folder of a teacher on the untrained controller, which decides every second control step."""
+    torch.manual_seed(0)
+    network = Teacher(len(OBSTACLES), hidden=(16, 16))
+    manifest = build_manifest("teacher", features.CONTROLLER_LAYOUTS, control_period=0.04)
+    manifest |= {"network": network.settings, "course": "bar_jump"}
+    manifest["bbc"] = Artifact.load(untrained / "policy").manifest["weights"]["sha256"]
+    Artifact.save(tmp_path / "teacher" / "policy", network.state_dict(), manifest)
+    return tmp_path / "teacher"
+
+
+@pytest.fixture
+def make_student(untrained_teacher: Path, tmp_path: Path, module: Callable[[str], ModuleType]) -> Callable[..., Path]:
+    """Write the run folder of an untrained student of the untrained teacher: ``make_student("name", byol=False)``."""
+
+    def make(name: str = "student", *, byol: bool = True, seed: int = 0, **changes: object) -> Path:
+        torch.manual_seed(seed)
+        teacher = Artifact.load(untrained_teacher / "policy")
+        network = RecurrentStudent(**teacher.manifest["network"], memory=16, encoder_hidden=8)
+        camera = module("tsc_artifacts").describe_camera()
+        camera["training"] = {"frame_steps": 1, "latency": [1, 1], "pitch": 0.09, "offset_noise": 0.05}
+        manifest = build_manifest("student", features.CONTROLLER_LAYOUTS, control_period=0.04)
+        manifest |= {"network": network.settings, "camera": camera, "byol": byol, "course": "bar_jump"}
+        manifest |= {"bbc": teacher.manifest["bbc"], "teacher": teacher.manifest["weights"]["sha256"], **changes}
+        Artifact.save(tmp_path / name / "policy", network.state_dict(), manifest)
+        return tmp_path / name
+
+    return make
 
 
 @pytest.fixture

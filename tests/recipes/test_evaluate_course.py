@@ -17,12 +17,10 @@ from rich.console import Console
 from tensordict import TensorDict
 
 from agility_rl import keys
-from agility_rl.deploy.artifact import Artifact, build_manifest
+from agility_rl.deploy.artifact import Artifact
 from agility_rl.envs import COURSES, AgilityEnv
 from agility_rl.envs.layout import CourseLayout
 from agility_rl.envs.obstacles import OBSTACLES, SEESAW_TILT
-from agility_rl.go2 import features
-from agility_rl.modules import Teacher
 from agility_rl.record.footprint import footprint
 
 TUNNEL = list(OBSTACLES).index("tunnel")
@@ -40,20 +38,18 @@ def rollouts(module: Module) -> ModuleType:
 
 
 @pytest.fixture
+def deciders(module: Module) -> ModuleType:
+    return module("deciders")
+
+
+@pytest.fixture
 def judgement(module: Module) -> ModuleType:
     return module("course_judgement")
 
 
 @pytest.fixture
-def teacher(untrained: Path, tmp_path: Path) -> Path:
-    """Run folder of an untrained teacher on the untrained controller, which decides every second control step."""
-    torch.manual_seed(0)
-    network = Teacher(len(OBSTACLES), hidden=(16, 16))
-    manifest = build_manifest("teacher", {"proprioception": features.PROPRIOCEPTION_LAYOUT}, control_period=0.04)
-    manifest |= {"network": network.settings, "course": "bar_jump"}
-    manifest["bbc"] = Artifact.load(untrained / "policy").manifest["weights"]["sha256"]
-    Artifact.save(tmp_path / "teacher" / "policy", network.state_dict(), manifest)
-    return tmp_path / "teacher"
+def teacher(untrained_teacher: Path) -> Path:
+    return untrained_teacher
 
 
 @pytest.fixture
@@ -119,31 +115,31 @@ def test_a_script_needs_no_teacher_and_a_course_may_be_a_file(
     assert pictures == {"course_mine.png", "course_box.png", "course_behaviours.png"}
 
 
-def test_fewer_behaviours(rollouts: ModuleType, teacher: Path, untrained: Path) -> None:
-    decider = rollouts.load_teacher(teacher, untrained, ("jump",))
+def test_fewer_behaviours(deciders: ModuleType, teacher: Path, untrained: Path) -> None:
+    decider = deciders.load_decider(teacher, untrained, ("jump",))
     sizes = {"proprioception": (45,), "history": (10, 45), "heading_error": (2,), "obstacle": (7,), "scandots": (132,)}
     td = TensorDict({name: torch.randn(50, *size) for name, size in sizes.items()}, [50])
     assert set(decider.decide(td)["action", "behaviour"].tolist()) == {4}
-    free = rollouts.load_teacher(teacher, untrained, None)
+    free = deciders.load_decider(teacher, untrained, None)
     assert (decider.behaviours, len(free.behaviours)) == (("jump",), 5)
     assert len(set(free.decide(td)["action", "behaviour"].tolist())) > 1, "else the line above would show nothing"
 
 
-def test_a_script_commands_its_speed_and_turns_to_the_way_point(rollouts: ModuleType, untrained: Path) -> None:
-    decider = rollouts.load_script("trot:1.2", untrained)
+def test_a_script_commands_its_speed_and_turns_to_the_way_point(deciders: ModuleType, untrained: Path) -> None:
+    decider = deciders.load_script("trot:1.2", untrained)
     td = TensorDict({keys.HEADING_ERROR: torch.tensor([[0.3, 0.0], [-0.3, 0.0]])}, [2])
     action = decider.decide(td)["action"]
     assert action["behaviour"].tolist() == [2, 2]
-    command, shift = rollouts.behaviours.commands_from_parameters(action["behaviour"], action["parameters"][:, 2])
+    command, shift = deciders.behaviours.commands_from_parameters(action["behaviour"], action["parameters"][:, 2])
     assert command[:, 0].tolist() == pytest.approx([1.2, 1.2])
     assert command[:, 2].tolist() == pytest.approx([0.6, -0.6])  # 2 rad/s for each radian
     assert command[:, 1].tolist() == pytest.approx([0.0, 0.0]) and shift.tolist() == [[0.0], [0.0]]
 
 
 def test_a_held_decision_is_what_the_environment_would_hold(
-    rollouts: ModuleType, recipe: ModuleType, untrained: Path
+    deciders: ModuleType, rollouts: ModuleType, recipe: ModuleType, untrained: Path
 ) -> None:
-    decider = replace(rollouts.load_script("trot:1.2", untrained), decision_steps=5)
+    decider = replace(deciders.load_script("trot:1.2", untrained), decision_steps=5)
     options: dict[str, Any] = {"start": "first", "command_noise": (1.0, 1.0), "episode_length": 0.4, "seed": 3}
     options |= {"simulator_options": {"num_threads": 1}, "terminations": {"never": lambda state: state.at_goal & False}}
     held = AgilityEnv(3, recipe.frozen(decider.controller), COURSES["tunnel"], decision_steps=5, **options)
@@ -164,10 +160,10 @@ def test_a_held_decision_is_what_the_environment_would_hold(
 
 
 def test_every_robot_gives_its_share_of_whole_episodes(
-    rollouts: ModuleType, recipe: ModuleType, untrained: Path
+    deciders: ModuleType, rollouts: ModuleType, recipe: ModuleType, untrained: Path
 ) -> None:
     """Half of the episodes end at once; whoever counted the first 16 to finish would hardly see the other half."""
-    decider = rollouts.load_script("walk:0.3", untrained)
+    decider = deciders.load_script("walk:0.3", untrained)
     env = AgilityEnv(
         4,
         recipe.frozen(decider.controller),
@@ -260,8 +256,8 @@ def test_way_points_follow_the_route(rollouts: ModuleType) -> None:
         torch.testing.assert_close(goals[4 * place + 1], layout.world(torch.tensor([index]), local)[0])
 
 
-def test_groups_of_courses(recipe: ModuleType, rollouts: ModuleType, untrained: Path) -> None:
-    decider = rollouts.load_script("trot:1.0", untrained)
+def test_groups_of_courses(deciders: ModuleType, recipe: ModuleType, untrained: Path) -> None:
+    decider = deciders.load_script("trot:1.0", untrained)
     config = recipe.Config(script="trot:1.0", course=("tunnel", "each", "tunnel"))
     assert recipe.names(config, decider) == ["tunnel", "bar_jump", "a_frame", "weave_poles", "seesaw", "tire_jump"]
     every = recipe.names(replace(config, course=("targets",)), decider)
@@ -274,8 +270,8 @@ def test_groups_of_courses(recipe: ModuleType, rollouts: ModuleType, untrained: 
     [
         ({"episodes": 0}, "expected --episodes"),
         ({"push_interval": 0.0}, "expected --push-interval"),
-        ({"script": "trot:1"}, "either the folder of a teacher or --script"),
-        ({"run": None}, "either the folder of a teacher or --script"),
+        ({"script": "trot:1"}, "either the folder of a teacher or student, or --script"),
+        ({"run": None}, "either the folder of a teacher or student, or --script"),
         ({"run": None, "script": "gallop:2"}, "expected BEHAVIOUR:SPEED such as trot:1.2, got 'gallop:2'"),
         ({"run": None, "script": "trot"}, "expected BEHAVIOUR:SPEED such as trot:1.2, got 'trot'"),
         ({"run": None, "script": "trot:9"}, r"trot goes at 0\.5 to 1\.5 m/s \(Table S2\), got 9 m/s"),
@@ -292,12 +288,14 @@ def test_impossible_options_are_refused(
     assert not (teacher / "course_evaluation.json").exists()
 
 
-def test_the_wrong_artifact_is_refused(recipe: ModuleType, config: Any, teacher: Path, untrained: Path) -> None:
-    with pytest.raises(ValueError, match=r"expected a teacher of tsc_teacher\.py, got an artifact of kind 'bbc'"):
+def test_the_wrong_artifact_is_refused(
+    deciders: ModuleType, recipe: ModuleType, config: Any, teacher: Path, untrained: Path
+) -> None:
+    with pytest.raises(ValueError, match=r"a student of tsc_student\.py, got an artifact of kind 'bbc'"):
         recipe.evaluate(replace(config, run=untrained), screen())
     with pytest.raises(ValueError, match="expected an artifact of kind 'bbc', got 'teacher'"):
         recipe.evaluate(replace(config, bbc=teacher), screen())
-    other = recipe.load_script("trot:1.0", untrained).controller
+    other = deciders.load_script("trot:1.0", untrained).controller
     weights = {name: tensor + 1.0 for name, tensor in other.artifact.state.items()}
     manifest = {name: value for name, value in other.artifact.manifest.items() if name != "weights"}
     Artifact.save(untrained.parent / "other", weights, manifest)

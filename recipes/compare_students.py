@@ -1,0 +1,233 @@
+"""Students with and without BYOL, of several seeds: success under each disturbance of their camera.
+
+In:  run folders of ``tsc_student.py`` (each says itself whether it was trained with BYOL) and that of their teacher.
+Out: tables on the screen, ``OUTPUT/student_comparison.json`` (also after every cell, so that what is done is not lost)
+     and ``OUTPUT/figures/success_under_disturbance.png``.
+
+    python recipes/compare_students.py runs/with_0 runs/with_1 runs/without_0 runs/without_1 --teacher runs/my_teacher
+
+All of them meet the same courses, drawn from a seed that no training used. A success rate of several runs is their mean
+with a Student-t interval over the runs; of one run it has a Wilson interval.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+from course_judgement import summarise
+from deciders import Decider, load_decider
+from disturbances import Disturbance, chosen
+from evaluate_course import Config as CourseConfig
+from evaluate_course import simulate
+from judgement import make_table, show, to_json
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import Progress
+from tsc_setup import course_of
+
+from agility_rl.record.plots import new_figure, save_figure
+from agility_rl.training import cli, metrics
+
+GROUPS = {True: "with BYOL", False: "without BYOL"}
+OF_TEACHER, HALVED = 0.9, 0.5
+"""Targets of stage 4: share of the teacher's success, and of the loss of success under disturbance."""
+
+
+@dataclass(frozen=True)
+class Config:
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Run or artifact folders of students."""
+    teacher: Path | None = None
+    """Run or artifact folder of the teacher that they learned from."""
+    bbc: Path | None = None
+    """Folder of the Basic Behaviour Controller; that of the training by default."""
+    course: str = "full"
+    """Preset course or course file."""
+    disturbance: tuple[str, ...] = ("all",)
+    """None, rectangles, noise, blur, dropout, late_1, late_2, pitch; ``all`` for each of them."""
+    strength: int = 1
+    """How many times images are disturbed."""
+    episodes: int = 300
+    """Of each student under each disturbance."""
+    robots: int = 100
+    """Most robots simulated at once."""
+    episode_length: float = 40.0
+    """Seconds until an episode counts as failed."""
+    seed: int = 1000
+    """Of courses and start places."""
+    num_threads: int | None = None
+    """Threads of the simulator."""
+    output: Path = Path("runs/student_comparison")
+    """Folder of the results."""
+
+
+def rate(successes: Sequence[int], episodes: int) -> metrics.Interval:
+    """Success of one run, or the mean of several."""
+    if len(successes) == 1:
+        return metrics.wilson_interval(successes[0], episodes)
+    return metrics.mean_interval(torch.tensor(successes) / episodes)
+
+
+def conclude(found: Mapping[str, Any], teacher: int | None, episodes: int) -> dict[str, Any]:
+    """Success and its loss for every group and disturbance, and the targets.
+
+    Args:
+        found: by run, ``byol`` and ``successes`` by disturbance.
+        teacher: successes of the teacher.
+        episodes: behind every number of successes.
+    """
+    groups: dict[str, Any] = {}
+    for byol, name in GROUPS.items():
+        runs = [one["successes"] for one in found.values() if one["byol"] is byol]
+        if not runs:
+            continue
+        disturbed = [key for key in runs[0] if key != "none"]
+        group: dict[str, Any] = {"success": {key: rate([run[key] for run in runs], episodes) for key in runs[0]}}
+        if "none" in runs[0]:
+            loss = {key: torch.tensor([run["none"] - run[key] for run in runs]) / episodes for key in disturbed}
+            group["loss"] = {key: metrics.mean_interval(value) for key, value in loss.items()}
+            if loss:
+                group["mean_loss"] = metrics.mean_interval(torch.stack(tuple(loss.values())).mean(0))
+        groups[name] = group
+    targets: list[dict[str, Any]] = []
+
+    def add(name: str, value: float, target: str, passed: bool) -> None:
+        targets.append({"name": name, "value": value, "target": target, "passed": passed})
+
+    if teacher:
+        for name, group in groups.items():
+            if "none" in group["success"]:
+                share = group["success"]["none"].estimate * episodes / teacher
+                add(f"{name}: success / the teacher's", share, f">= {OF_TEACHER:g}", share >= OF_TEACHER)
+    losses = [groups[name]["mean_loss"].estimate for name in GROUPS.values() if "mean_loss" in groups.get(name, {})]
+    if len(losses) == 2 and losses[1] > 0.0:  # else there is nothing to halve
+        limit = HALVED * losses[1]
+        add("mean loss of success with BYOL", losses[0], f"<= {limit:.3f}, half of that without", losses[0] <= limit)
+    return {"groups": groups, "targets": targets}
+
+
+def print_comparison(result: Mapping[str, Any], disturbances: Mapping[str, Disturbance], console: Console) -> None:
+    """Print the tables."""
+    groups = result["groups"]
+    columns = [column for name in groups for column in (name, "loss")]
+    table = make_table(f"success on {result['course']}, 95 % intervals", "disturbance", *columns)
+    for key, disturbance in disturbances.items():
+        cells = []
+        for group in groups.values():
+            loss = group.get("loss", {}).get(key)
+            cells += [show(group["success"][key]), "" if loss is None else f"{loss.estimate:+.3f}"]
+        table.add_row(disturbance.label, *cells)
+    console.print(table)
+    table = make_table("successes of each run", "run", "", *(one.label for one in disturbances.values()))
+    for name, run in result["runs"].items():
+        kind = GROUPS[run["byol"]]
+        table.add_row(name, kind, *(f"{run['successes'][key]}/{result['episodes']}" for key in disturbances))
+    if result["teacher"] is not None:
+        table.add_row(result["teacher"]["run"], "teacher", f"{result['teacher']['successes']}/{result['episodes']}")
+    console.print(table)
+    for row in result["targets"]:
+        verdict = "[green]pass[/]" if row["passed"] else "[red]FAIL[/]"
+        console.print(f"{row['name']}: {row['value']:.3f}, target {row['target']}: {verdict}", highlight=False)
+
+
+def bars(groups: Mapping[str, Any], disturbances: Mapping[str, Disturbance]) -> Figure:
+    """Success under each disturbance, one colour a group."""
+    figure = new_figure(9.0, 3.6)
+    axes, width = figure.add_subplot(), 0.8 / max(1, len(groups))
+    for number, (name, group) in enumerate(groups.items()):
+        values = [group["success"][key] for key in disturbances]
+        estimates = torch.tensor([value.estimate for value in values])
+        low = estimates - torch.tensor([max(0.0, value.low) for value in values])
+        high = torch.tensor([min(1.0, value.high) for value in values]) - estimates
+        places = torch.arange(len(values)) + (number - (len(groups) - 1) / 2) * width
+        axes.bar(places.numpy(), estimates.numpy(), width, label=name)
+        errors = torch.stack((low, high)).clamp(min=0.0).numpy()
+        axes.errorbar(places.numpy(), estimates.numpy(), errors, fmt="none", color="black", linewidth=0.8)
+    axes.set_xticks(range(len(disturbances)), [one.label for one in disturbances.values()], rotation=20, fontsize=8)
+    axes.set_ylim(0.0, 1.0)
+    axes.set_ylabel("success")
+    axes.legend(fontsize=8)
+    return figure
+
+
+def compare(config: Config, console: Console) -> dict[str, Any]:
+    """Simulate everything; writes the result and returns it."""
+    if not config.runs or config.episodes < 1 or config.robots < 1:
+        raise ValueError("expected the folders of one student or more, --episodes and --robots of at least 1")
+    begin, disturbances = time.monotonic(), chosen(config.disturbance, config.strength)
+    course = course_of(config.course)
+    students = [load_decider(path, config.bbc, kind="student") for path in config.runs]
+    teacher = None if config.teacher is None else load_decider(config.teacher, config.bbc, kind="teacher")
+    names = [str(path) for path in config.runs]
+    if len(set(names)) < len(names):
+        raise ValueError("every student counts once: a run folder is given twice")
+    if teacher is not None:
+        for name, student in zip(names, students, strict=True):
+            if student.manifest["teacher"] != teacher.weights:
+                raise ValueError(f"{name} did not learn from the teacher of {config.teacher}; give the one it names")
+    found: dict[str, Any] = {}
+    result: dict[str, Any] = {
+        "format": "agility_rl.student_comparison",
+        "format_version": 1,
+        "course": config.course,
+        "episodes": config.episodes,
+        "settings": config,
+        "versions": cli.versions(),
+        "runs": found,
+        "teacher": None,
+        "complete": False,
+    }
+    options = CourseConfig(
+        episodes=config.episodes,
+        robots=config.robots,
+        episode_length=config.episode_length,
+        seed=config.seed,
+        num_threads=config.num_threads,
+    )
+    config.output.mkdir(parents=True, exist_ok=True)
+
+    with Progress(console=console, transient=True) as bar:
+
+        def count(decider: Decider, disturbance: Disturbance) -> tuple[int, dict[str, Any]]:
+            task = bar.add_task(f"{decider.name}, {disturbance.label}", total=config.episodes)
+            episodes = simulate(course, decider, options, lambda: bar.advance(task), disturbance)
+            bar.remove_task(task)
+            summary = summarise(course, episodes)
+            return sum(episode.success for episode in episodes), summary["obstacles"]
+
+        if teacher is not None:
+            successes, obstacles = count(teacher, chosen(("none",))["none"])
+            result["teacher"] = {"run": teacher.name, "successes": successes, "obstacles": obstacles}
+        for name, student in zip(names, students, strict=True):
+            entry: dict[str, Any] = {"byol": bool(student.manifest["byol"]), "weights": student.weights}
+            found[name] = entry | {"successes": {}, "obstacles": {}}
+            for key, disturbance in disturbances.items():
+                found[name]["successes"][key], found[name]["obstacles"][key] = count(student, disturbance)
+                cli.write_json(config.output / "student_comparison.json", to_json(result))
+    beside = None if result["teacher"] is None else result["teacher"]["successes"]
+    result |= conclude(found, beside, config.episodes) | {"complete": True, "seconds": time.monotonic() - begin}
+    cli.write_json(config.output / "student_comparison.json", to_json(result))
+    figure = bars(result["groups"], disturbances)
+    save_figure(figure, config.output / "figures" / "success_under_disturbance.png")
+    print_comparison(result, disturbances, console)
+    return result
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    config = tyro.cli(Config, args=arguments, description=__doc__)
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=160)
+    with cli.one_line_errors():
+        compare(config, console)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,176 @@
+"""What decides on a course when it is evaluated: a teacher, a student with its camera and memory, or a script."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from disturbances import Disturbance
+from rollouts import Controller, load_controller
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from tsc_artifacts import load_bbc_of, load_trained
+from tsc_config import Config as TeacherConfig
+
+from agility_rl import behaviours, keys
+from agility_rl.envs import AgilityEnv
+from agility_rl.envs.decisions import NUM_PARAMETERS
+from agility_rl.envs.depth import DepthObservation
+from agility_rl.modules import RecurrentStudent
+from agility_rl.modules.student import NEXT_HIDDEN
+
+Decide = Callable[[TensorDictBase], TensorDictBase]
+"""Observations of a course to decisions under ``action``."""
+STEERING = 2.0
+"""Turn rate that a script commands for each radian of heading error [1/s]."""
+
+
+class Senses:
+    """Camera and memory of a student in an environment that decides at every control step.
+
+    A robot looks when its decision is due, so only those images are taken; its memory begins anew with an episode.
+
+    Args:
+        env: where the robots live; it needs no camera of its own.
+        student: whose memory it is.
+        decision_steps: control steps of a decision.
+        camera: keyword arguments of :class:`DepthObservation`.
+        disturbance: what disturbs the images.
+        seed: of the camera's noise and of the disturbance.
+    """
+
+    def __init__(
+        self,
+        env: AgilityEnv,
+        student: RecurrentStudent,
+        decision_steps: int,
+        camera: Mapping[str, Any],
+        disturbance: Disturbance,
+        seed: int,
+    ) -> None:
+        generator = torch.Generator().manual_seed(seed)
+        self.eyes = DepthObservation(env.simulator, generator, decision_steps, **disturbance.camera(camera))
+        self.disturb = disturbance.images(generator)
+        self.hidden = student.initial_hidden(env.num_robots)
+        self.is_init = torch.ones(env.num_robots, 1, dtype=torch.bool)
+
+    def begin(self, mask: Tensor) -> None:
+        """Episodes of the rows of a bool mask ``[N]`` begin."""
+        self.eyes.begin(mask)
+        self.is_init = self.is_init | mask[:, None]
+
+    def advance(self) -> None:
+        """A control step has passed."""
+        self.eyes.advance()
+
+    def observe(self, td: TensorDictBase, rows: Tensor) -> TensorDictBase:
+        """Add to observations of the M rows of a bool mask what the student reads besides."""
+        td[keys.DEPTH] = self.disturb(self.eyes.image()[rows])
+        td[keys.HIDDEN], td["is_init"] = self.hidden[rows], self.is_init[rows]
+        return td
+
+    def remember(self, td: TensorDictBase, rows: Tensor) -> None:
+        """Keep the memory that the student wrote."""
+        self.hidden[rows] = td[NEXT_HIDDEN]
+        self.is_init = self.is_init & ~rows[:, None]
+
+
+@dataclass(frozen=True)
+class Decider:
+    """What decides, how often, and the Basic Behaviour Controller that it tells."""
+
+    decide: Decide
+    decision_steps: int
+    controller: Controller
+    name: str
+    run: Path | None
+    weights: str | None
+    course: str
+    """Course that it was trained on."""
+    behaviours: tuple[str, ...]
+    """Behaviours that it may choose."""
+    student: RecurrentStudent | None = None
+    """The network, when it is one that looks and remembers."""
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+    """Of its artifact."""
+
+    @property
+    def kind(self) -> str:
+        """``teacher``, ``student`` or ``script``."""
+        return str(self.manifest.get("kind", "script"))
+
+    def senses(self, env: AgilityEnv, disturbance: Disturbance, seed: int) -> Senses | None:
+        """What a student needs besides the observations of an environment."""
+        if self.student is None:
+            return None
+        camera = self.manifest["camera"]["training"]
+        return Senses(env, self.student, self.decision_steps, camera, disturbance, seed)
+
+
+def load_decider(
+    path: Path, bbc: Path | None, allowed: Sequence[str] | None = None, kind: str | None = None
+) -> Decider:
+    """The deterministic deployable teacher or student of a run or artifact folder, with the controller of its training.
+
+    Args:
+        path: run or artifact folder.
+        bbc: folder of the controller; that of the training by default.
+        allowed: behaviours that it may choose; those of the training by default.
+        kind: ``teacher`` or ``student``; either by default.
+
+    Raises:
+        FileNotFoundError: if something is missing.
+        ArtifactError: if it is damaged, something else, or was trained on another controller.
+        ValueError: if a behaviour is unknown.
+    """
+    trained = load_trained(path, kind, allowed)
+    network = trained.network
+    student = network if isinstance(network, RecurrentStudent) else None
+    return Decider(
+        network.policy() if isinstance(network, RecurrentStudent) else network.deployable_policy(),
+        trained.decision_steps,
+        load_bbc_of(trained, bbc),
+        trained.run.name,
+        trained.run,
+        trained.digest,
+        trained.course,
+        tuple(behaviours.BEHAVIOURS[index] for index in trained.allowed),
+        student,
+        trained.artifact.manifest,
+    )
+
+
+def load_script(script: str, bbc: Path | None) -> Decider:
+    """One behaviour at one speed, turned towards the way-point; everything else in the middle of its range.
+
+    Args:
+        script: ``BEHAVIOUR:SPEED``, speed in m/s.
+        bbc: folder of the controller; the pretrained one by default.
+
+    Raises:
+        ValueError: if it is no such text, or the behaviour has no such speed.
+    """
+    name, _, number = script.partition(":")
+    try:
+        skill, speed = behaviours.skill_index(name), float(number)
+    except ValueError as error:
+        raise ValueError(f"--script: expected BEHAVIOUR:SPEED such as trot:1.2, got {script!r} ({error})") from None
+    low, high = behaviours.command_bounds()
+    slowest, fastest = low[skill, 0].item(), high[skill, 0].item()
+    if not slowest - 1e-6 <= speed <= fastest + 1e-6:
+        raise ValueError(f"--script: {name} goes at {slowest:g} to {fastest:g} m/s (Table S2), got {number} m/s")
+    turn = behaviours.COMMANDS.index("yaw_rate")
+
+    def decide(td: TensorDictBase) -> TensorDictBase:
+        n = len(td)
+        parameters = torch.zeros(n, behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS)
+        parameters[:, skill, 0] = 2.0 * (speed - slowest) / (fastest - slowest) - 1.0
+        parameters[:, skill, turn] = STEERING * td[keys.HEADING_ERROR][:, 0] / high[skill, turn]  # clipped by the env
+        decision = {keys.BEHAVIOUR: torch.full((n,), skill), keys.PARAMETERS: parameters}
+        return td.set(keys.ACTION, TensorDict(decision, td.batch_size))
+
+    label = f"script_{name}_{speed:g}"
+    return Decider(decide, 1, load_controller(bbc or TeacherConfig().bbc), label, None, None, "full", (name,))

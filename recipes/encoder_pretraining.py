@@ -1,0 +1,103 @@
+"""Before the imitation: the depth encoder learns from images that the teacher's robots see on the course.
+
+A single image is asked for what the teacher's scandots are encoded to, and for the obstacle ahead; with BYOL also that
+its disturbed views mean the same. Ours: the sources train the encoder from nothing, within the imitation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from tsc_student_config import Config
+from tsc_student_setup import Components, finite
+
+from agility_rl import keys
+from agility_rl.collectors import DAggerCollector
+from agility_rl.envs.obstacles import OBSTACLES
+from agility_rl.go2.camera import dequantize
+from agility_rl.modules.mlp import mlp
+from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
+
+
+@torch.no_grad()
+def collect_images(parts: Components, cfg: Config) -> TensorDictBase:
+    """Let the teacher walk and keep every ``every``-th decision's images.
+
+    Returns:
+        TensorDict ``[T, N]``, T N not less than wanted: ``depth`` in 8 or 16 bits, ``terrain_latent`` [T, N, 32],
+        ``obstacle`` int64 [T, N].
+    """
+    own, env = cfg.pretrain, parts.env
+    # The teacher has no memory: what the collector carries for it is a number that stays what it is.
+    remember = TensorDictModule(nn.Identity(), in_keys=[keys.HIDDEN], out_keys=[("memory", keys.HIDDEN)])
+    walker = DAggerCollector(
+        env,
+        TensorDictSequential(*parts.teacher.privileged_policy(), remember),
+        parts.teacher.privileged_policy(),
+        own.every,
+        initial_hidden=torch.zeros(env.num_robots, 1),
+        bits=cfg.bits,
+        keep=(keys.DEPTH, keys.SCANDOTS, keys.OBSTACLE),
+    )
+    rows = []
+    for _ in range(-(-own.images // env.num_robots)):
+        seen = walker.collect()[0].clone()  # a view would keep the whole window
+        latent = parts.teacher.scandots_encoder(seen.select(keys.SCANDOTS))[keys.TERRAIN_LATENT]
+        kept = {
+            keys.DEPTH: seen[keys.DEPTH],
+            keys.TERRAIN_LATENT: latent,
+            keys.OBSTACLE: seen[keys.OBSTACLE].argmax(-1),
+        }
+        rows.append(TensorDict(kept, seen.batch_size))
+    return torch.stack(rows)  # type: ignore[return-value, arg-type]
+
+
+def pretrain(
+    parts: Components, cfg: Config, represent: Callable[[Tensor], dict[str, Tensor]] | None
+) -> dict[str, float]:
+    """Collect images, train the encoder on those of most robots, measure on those of the others.
+
+    Args:
+        parts: of the run; student and generators change.
+        cfg: its options.
+        represent: one step of BYOL on stored images; ``None`` for none.
+    """
+    own, generator = cfg.pretrain, parts.generator
+    images = collect_images(parts, cfg)
+    robots = images.batch_size[1]
+    apart = min(max(1, round(own.held_out * robots)), robots - 1)
+    train, test = images[:, apart:].flatten(), images[:, :apart].flatten()
+    head = mlp(32, (), NUM_TERRAIN_LATENT + len(OBSTACLES))
+    encoder = parts.student.depth_encoder.module
+    optimizer = torch.optim.Adam([*encoder.parameters(), *head.parameters()], lr=own.learning_rate)
+
+    def errors(sample: TensorDictBase, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        latent, logits = head(encoder(depth)).split((NUM_TERRAIN_LATENT, len(OBSTACLES)), -1)
+        kind = sample[keys.OBSTACLE]
+        error = (latent.tanh() - sample[keys.TERRAIN_LATENT]).square().mean()
+        return error, nn.functional.cross_entropy(logits, kind), (logits.argmax(-1) == kind).float().mean()
+
+    metrics: dict[str, float] = {"pretrain/images": float(len(train))}
+    for epoch in range(own.epochs):
+        for rows in torch.randperm(len(train), generator=generator).split(own.batch):
+            sample = train[rows]
+            latent, obstacle, _ = errors(sample, parts.augmentation.augment(dequantize(sample[keys.DEPTH])))
+            optimizer.zero_grad(set_to_none=True)
+            finite(latent + obstacle, "the pre-training", 0).backward()
+            optimizer.step()
+            if represent is not None and len(rows) > 1:
+                metrics |= {f"pretrain/{name}": value.item() for name, value in represent(sample[keys.DEPTH]).items()}
+        with torch.no_grad():
+            pieces = [(len(part), *errors(part, part[keys.DEPTH])) for part in test.split(own.batch)]
+        weights = torch.tensor([float(piece[0]) for piece in pieces])
+        values = torch.tensor([[float(value) for value in piece[1:]] for piece in pieces])
+        means = (weights[:, None] * values).sum(0) / weights.sum()
+        names = ("pretrain/error_latent", "pretrain/loss_obstacle", "pretrain/accuracy_obstacle")
+        metrics |= dict(zip(names, means.tolist(), strict=True))
+        shown = "  ".join(f"{name.removeprefix('pretrain/')} {metrics[name]:.3g}" for name in names)
+        print(f"pre-training {epoch + 1}/{own.epochs} on {len(train)} images; {len(test)} held out: {shown}")
+    return metrics

@@ -1,0 +1,86 @@
+"""How a training runs from its folder to its end: checkpoints, log, display, Ctrl-C, time limit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from agility_rl.record import MCAPLogger
+from agility_rl.training import cli
+from agility_rl.training.checkpoint import RunCheckpoint
+from agility_rl.training.display import Display
+
+
+class RunConfig(Protocol):
+    """Options that every such recipe has."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def runs(self) -> Path: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def max_minutes(self) -> float | None: ...
+    @property
+    def checkpoint_every(self) -> int: ...
+    @property
+    def resume(self) -> Path | None: ...
+
+
+def run(
+    recipe: str,
+    cfg: RunConfig,
+    *,
+    checkpoint: Callable[[Path, dict[str, float]], RunCheckpoint],
+    begin: Callable[[], None],
+    iterate: Callable[[int], dict[str, float]],
+    save_policy: Callable[[Path], None],
+    headline: tuple[str, ...],
+) -> Path:
+    """Train until the iterations, the time or the user end it, and save everything.
+
+    Args:
+        recipe: its name.
+        cfg: its options.
+        checkpoint: from a folder and the progress to the checkpoint of all parts.
+        begin: called once in a new run, before the first iteration.
+        iterate: from the number of finished iterations to the metrics of the next.
+        save_policy: writes the artifact into a run folder.
+        headline: metrics of a plain line.
+
+    Returns:
+        The run folder.
+    """
+    resumed = cfg.resume is not None
+    folder = cli.start_run(cfg, cfg.resume or cfg.runs / cfg.name, resume=resumed, recipe=recipe)
+    progress: dict[str, float] = {"iteration": 0, "minutes": 0.0}
+    saved = checkpoint(folder / "checkpoints", progress)
+    if resumed:
+        saved.load()
+    else:
+        begin()
+    logger = MCAPLogger(folder.name, folder.parent, resume=resumed)
+    start = time.monotonic() - 60.0 * progress["minutes"]
+
+    def save() -> None:
+        saved.save(int(progress["iteration"]))
+        save_policy(folder)
+
+    with Display(recipe, cfg.iterations, headline=headline) as display, cli.interruptible() as interrupted:
+        while progress["iteration"] < cfg.iterations and not interrupted():
+            metrics = iterate(int(progress["iteration"]))
+            progress["iteration"] += 1
+            progress["minutes"] = metrics["time/minutes"] = (time.monotonic() - start) / 60.0
+            logger.log_metrics(metrics, step=int(progress["iteration"]))
+            display.update(int(progress["iteration"]), metrics)
+            if progress["iteration"] % cfg.checkpoint_every == 0:
+                save()
+            if cfg.max_minutes is not None and progress["minutes"] >= cfg.max_minutes:
+                break
+    save()
+    logger.close()
+    print(f"saved {folder}")
+    return folder

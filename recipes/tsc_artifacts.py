@@ -1,0 +1,169 @@
+"""Trained Task-Specific Controllers on disk: teachers and students, whom they tell, and the camera they look by."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rollouts import Controller, load_controller
+from tsc_config import Config as TeacherConfig
+
+from agility_rl import behaviours, keys
+from agility_rl.deploy.artifact import Artifact, ArtifactError
+from agility_rl.envs.obstacles import OBSTACLES
+from agility_rl.go2 import camera, constants, features
+from agility_rl.modules import RecurrentStudent, Teacher
+
+NETWORKS: dict[str, type[Teacher] | type[RecurrentStudent]] = {"teacher": Teacher, "student": RecurrentStudent}
+RECIPES = {"teacher": "tsc_teacher.py", "student": "tsc_student.py"}
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A teacher or a student with its artifact.
+
+    Attributes:
+        network: what was trained.
+        artifact: where it comes from.
+        run: folder of its run.
+        allowed: indices of the behaviours that it may choose.
+    """
+
+    network: Teacher | RecurrentStudent
+    artifact: Artifact
+    run: Path
+    allowed: tuple[int, ...]
+
+    @property
+    def kind(self) -> str:
+        """``teacher`` or ``student``."""
+        return str(self.artifact.manifest["kind"])
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its weights."""
+        return str(self.artifact.manifest["weights"]["sha256"])
+
+    @property
+    def decision_steps(self) -> int:
+        """Control steps of a decision."""
+        return round(self.artifact.manifest["control_period"] / constants.CONTROL_DT)
+
+    @property
+    def course(self) -> str:
+        """Course of its training."""
+        return str(self.artifact.manifest.get("course", "full"))
+
+
+def load_trained(path: Path, kind: str | None = None, allowed: Sequence[str] | None = None) -> Trained:
+    """The teacher or student of a run or artifact folder.
+
+    Args:
+        path: run or artifact folder.
+        kind: ``teacher`` or ``student``; either by default.
+        allowed: behaviours that it may choose; those of its training by default.
+
+    Raises:
+        FileNotFoundError: if something is missing.
+        ArtifactError: if it is damaged, something else, or looks by another camera.
+        ValueError: if a behaviour is unknown.
+    """
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: expected the folder of a run or an artifact, found none; check the path")
+    run = path.parent if path.name == "policy" else path
+    artifact = Artifact.load(path / "policy" if (path / "policy").is_dir() else path)
+    manifest = artifact.manifest
+    expected = NETWORKS if kind is None else (kind,)
+    if manifest["kind"] not in expected or "network" not in manifest:
+        wanted = " or ".join(f"a {name} of {RECIPES[name]}" for name in expected)
+        advice = "; a BBC decides nothing: give it as --bbc, with a teacher or with --script BEHAVIOUR:SPEED"
+        raise ArtifactError(
+            f"{artifact.folder}: expected {wanted}, got an artifact of kind {manifest['kind']!r}"
+            + (advice if manifest["kind"] == "bbc" else "")
+        )
+    artifact.check_layout(keys.PROPRIOCEPTION, features.PROPRIOCEPTION_LAYOUT)
+    if manifest["kind"] == "student":
+        check_camera(artifact)
+    network = dict(manifest["network"])
+    if network["num_obstacles"] != len(OBSTACLES):
+        raise ArtifactError(
+            f"{artifact.folder}: knows {network['num_obstacles']} types of obstacles, expected {len(OBSTACLES)}"
+        )
+    known = range(behaviours.NUM_BEHAVIOURS) if network["allowed"] is None else network["allowed"]
+    if allowed is not None:
+        network["allowed"] = sorted(behaviours.skill_index(name) for name in allowed)
+        if not allowed or not set(network["allowed"]) <= set(known):
+            names = ", ".join(behaviours.BEHAVIOURS[index] for index in known)
+            raise ValueError(f"--behaviours: expected some of those that it was trained with, {names}; got {allowed}")
+    module = NETWORKS[manifest["kind"]](**network)
+    mask = module.actor.network.mask.clone()
+    try:
+        module.load_state_dict(artifact.state)
+    except RuntimeError as error:
+        raise ArtifactError(f"{artifact.folder}: the weights are not those of the network it names: {error}") from error
+    module.actor.network.mask.copy_(mask)
+    return Trained(module, artifact, run, tuple(network["allowed"] or known))
+
+
+def load_bbc_of(trained: Trained, bbc: Path | None) -> Controller:
+    """The Basic Behaviour Controller that a teacher or student was trained on.
+
+    Args:
+        trained: it.
+        bbc: folder of the controller; that of the training by default.
+
+    Raises:
+        ArtifactError: if it is another one.
+    """
+    controller = load_controller(bbc or trained_bbc(trained.run))
+    digest, expected = controller.artifact.manifest["weights"]["sha256"], trained.artifact.manifest.get("bbc")
+    if expected != digest:
+        raise ArtifactError(
+            f"{controller.artifact.folder} holds the BBC {digest[:12]}, but {trained.artifact.folder} was trained on "
+            f"{str(expected)[:12]}; give that one as --bbc"
+        )
+    return controller
+
+
+def trained_bbc(run: Path) -> Path:
+    """Where a run's configuration says its controller was, else where the pretrained one is."""
+    file = run / "config.json"
+    if not file.is_file():
+        return TeacherConfig().bbc
+    try:
+        return Path(json.loads(file.read_text(encoding="utf-8"))["config"]["bbc"])
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{file} is damaged or no run's configuration: {error}; give the BBC as --bbc") from error
+
+
+def describe_camera() -> dict[str, Any]:
+    """The camera and what becomes of its images, for the manifest of a student."""
+    return {
+        "sensor": [camera.SENSOR_HEIGHT, camera.SENSOR_WIDTH],
+        "downsampling": camera.DOWNSAMPLING,
+        "crop": [camera.CROP_TOP, camera.CROP_BOTTOM, camera.CROP_LEFT, camera.CROP_RIGHT],
+        "image": [camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH],
+        "horizontal_field": camera.HORIZONTAL_FIELD,
+        "position": list(camera.POSITION),
+        "depth_range": [camera.DEPTH_NEAR, camera.DEPTH_FAR],
+        "normalised": "(clip(z, near, far) - near) / (far - near) - 0.5",
+        "units": "rows and columns; rad; m in the trunk's frame",
+    }
+
+
+def check_camera(artifact: Artifact) -> None:
+    """Refuse a student whose images were others.
+
+    Raises:
+        ArtifactError: at the first number that differs.
+    """
+    saved = artifact.manifest.get("camera", {})
+    for name, here in describe_camera().items():
+        if saved.get(name) != here:
+            raise ArtifactError(
+                f"{artifact.folder}: the student was trained with images of {name} {saved.get(name)}, this code's "
+                f"camera has {here}; use the release that wrote it, or train the student again"
+            )

@@ -1,0 +1,173 @@
+"""Stage 4: learn from a teacher to pass the course by depth images and memory, with DAgger and BYOL.
+
+Source: Fu et al. 2025, supplement S2, S3, S6, S8, Algorithm S3 (lines 8 to 12), Eq. (15); method notes, sections 5.8 to
+5.11.
+
+In:  a teacher (``--teacher RUN``) and the Basic Behaviour Controller that it was trained on (``--bbc RUN``; found by
+     itself where that still lies), which both stay as they are.
+Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap``, ``checkpoints/``, ``policy/`` (kind ``student``).
+
+    python recipes/tsc_student.py cpu --teacher runs/my_teacher --name my_student
+    python recipes/tsc_student.py cpu --teacher runs/my_teacher --name without --no-byol
+    python recipes/tsc_student.py cpu --teacher runs/my_teacher --pretrain.images 20000
+    python recipes/tsc_student.py cpu --resume runs/my_student            # goes on exactly where it stopped
+
+Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper``. Ctrl-C ends the iteration and saves.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from course_metrics import judge, set_course
+from encoder_pretraining import pretrain
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from training_run import run
+from tsc_student_config import PRESETS, Config
+from tsc_student_setup import (
+    Components,
+    annealed,
+    build,
+    finite,
+    load_student,
+    resolve,
+    save_policy,
+    set_learning_rate,
+)
+
+from agility_rl import keys
+from agility_rl.envs.obstacles import OBSTACLES
+from agility_rl.go2.camera import dequantize
+from agility_rl.training import cli
+
+HEADLINE: tuple[str, ...] = ("time/minutes", "success", "episodes", "falls_per_minute")
+HEADLINE += ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_byol", "spread")
+HEADLINE += ("accuracy_behaviour", "accuracy_obstacle", "error_heading")
+HEADLINE += tuple(f"success/{name}" for name in OBSTACLES)
+
+
+def imitate(parts: Components, cfg: Config, window: TensorDictBase, iteration: int) -> dict[str, Tensor]:
+    """Descend Eq. (15) through the whole window (Algorithm S3, line 11); returns mean losses and accuracies."""
+    own = cfg.imitation
+    found: list[TensorDictBase] = []
+    for _ in range(own.epochs):
+        for rows in torch.randperm(window.shape[1], generator=parts.generator).chunk(own.minibatches):
+            sample = window[:, rows]
+            if own.augment:
+                sample[keys.DEPTH] = parts.augmentation.augment(dequantize(sample[keys.DEPTH]))
+            losses = parts.imitation(sample)
+            total = torch.stack([value for name, value in losses.items() if name.startswith("loss_")]).sum()
+            parts.optimizer.zero_grad(set_to_none=True)
+            finite(total, "the imitation", iteration).backward()
+            parameters = parts.optimizer.param_groups[0]["params"]
+            norm = torch.nn.utils.clip_grad_norm_(parameters, own.max_grad_norm)
+            parts.optimizer.step()
+            found.append(losses.detach().set("grad_norm", norm))
+    return {name: torch.stack([losses[name] for losses in found]).mean() for name in found[0].keys()}  # noqa: SIM118
+
+
+def represent(parts: Components, iteration: int, images: Tensor) -> dict[str, Tensor]:
+    """One step of BYOL on stored images ``[M, 58, 87]``, each seen disturbed in two ways (method notes, 5.10)."""
+    byol = parts.representation
+    assert byol is not None
+    views = {f"view_{n}": {keys.DEPTH: parts.augmentation.augment(dequantize(images))} for n in (1, 2)}
+    losses = byol.loss(TensorDict(views, [len(images)]))
+    byol.optimizer.zero_grad(set_to_none=True)
+    finite(losses["loss_byol"], "BYOL", iteration).backward()
+    byol.optimizer.step()
+    byol.average.step()
+    return dict(losses.detach().items())
+
+
+def represent_window(parts: Components, cfg: Config, window: TensorDictBase, iteration: int) -> dict[str, Tensor]:
+    """BYOL on images drawn from a window; returns the means."""
+    images, own = window[keys.DEPTH].flatten(0, 1), cfg.representation
+    chosen = torch.randperm(len(images), generator=parts.generator)[: own.images]
+    found = [represent(parts, iteration, images[rows]) for rows in chosen.chunk(own.minibatches)]
+    return {name: torch.stack([losses[name] for losses in found]).mean() for name in found[0]}
+
+
+def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
+    """One iteration of Algorithm S3's second loop; returns metrics by name."""
+    clock = time.perf_counter()
+    times = {}
+
+    def lap(name: str) -> None:
+        nonlocal clock
+        now = time.perf_counter()
+        times[f"time/{name}"], clock = now - clock, now
+
+    own, byol = cfg.imitation, parts.representation
+    rate = annealed(own.learning_rate, own.final_learning_rate, iteration, own.decay)
+    set_learning_rate(parts.optimizer, rate)
+    if byol is not None:
+        rates = (cfg.representation.learning_rate, cfg.representation.final_learning_rate)
+        set_learning_rate(byol.optimizer, annealed(*rates, iteration, own.decay))
+    set_course(parts.env, parts.curriculum)
+    metrics: dict[str, Tensor | float] = {}
+    if iteration == 0 and cfg.pretrain.images > 0 and cfg.init_from is None:
+        metrics |= pretrain(parts, cfg, None if byol is None else lambda images: represent(parts, iteration, images))
+        lap("pretrain")
+    window = parts.collector.collect()
+    lap("collect")
+    metrics |= judge(parts.env, parts.curriculum, window)
+    metrics |= imitate(parts, cfg, window, iteration)
+    lap("imitation")
+    if byol is not None:
+        metrics |= represent_window(parts, cfg, window, iteration)
+        lap("byol")
+    metrics["reward"] = window["next", "reward"].mean()
+    metrics["learning_rate"] = rate
+    metrics["time/images_per_second"] = window.numel() / sum(times.values())
+    return {name: float(value) for name, value in metrics.items()} | times
+
+
+def check(cfg: Config) -> None:
+    """Refuse impossible options before anything is loaded."""
+    own, pre = cfg.imitation, cfg.pretrain
+    if min(own.steps, own.epochs, own.minibatches, own.decay, cfg.representation.minibatches) < 1:
+        raise ValueError("expected imitation.steps, epochs, minibatches, decay and representation.minibatches above 0")
+    if cfg.bits not in (8, 16):
+        raise ValueError(f"--bits: images are stored in 8 or 16 bits, got {cfg.bits}")
+    smallest = min(cfg.representation.images, cfg.env.num_robots * own.steps) // cfg.representation.minibatches
+    if cfg.byol and smallest < 2:
+        raise ValueError(f"--representation: a minibatch of BYOL needs 2 images or more, got {smallest}")
+    if pre.images and (cfg.env.num_robots < 2 or min(pre.every, pre.epochs, pre.batch) < 1 or not 0 < pre.held_out < 1):
+        raise ValueError(
+            "--pretrain: expected two robots or more, every, epochs and batch of at least 1, held-out within (0, 1)"
+        )
+
+
+def train(cfg: Config) -> Path:
+    """Algorithm S3, the student; returns the run folder."""
+    if cfg.resume is not None:  # a run goes on with its own options; only how long may change
+        own = cli.read_config(cfg.resume, Config)
+        cfg = replace(own, resume=cfg.resume, iterations=cfg.iterations, max_minutes=cfg.max_minutes)
+    check(cfg)
+    cfg, trained = resolve(cfg)
+    parts = build(cfg, trained)
+
+    def begin() -> None:
+        if cfg.init_from is not None:
+            load_student(parts, cfg.init_from)
+
+    folder = run(
+        "tsc_student",
+        cfg,
+        checkpoint=parts.checkpoint,
+        begin=begin,
+        iterate=lambda iteration: iterate(parts, cfg, iteration),
+        save_policy=lambda folder: save_policy(parts, cfg, folder),
+        headline=HEADLINE,
+    )
+    parts.env.close()
+    return folder
+
+
+if __name__ == "__main__":
+    with cli.one_line_errors():
+        train(cli.from_presets(PRESETS, doc=__doc__))

@@ -1,0 +1,174 @@
+"""Options and presets of the recipe that trains the Task-Specific Controller's student.
+
+``paper`` holds what supplement S2, S3, S6 and Algorithm S3 say, and the released code's values where they are silent
+(method notes, sections 5.1, 5.5, 5.8 to 5.11); ``cpu`` is for two cores.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from tsc_config import CurriculumConfig, RobotsConfig
+
+from agility_rl.go2 import camera
+from agility_rl.modules.student import HEADING_GATE
+
+
+@dataclass(frozen=True)
+class EnvConfig(RobotsConfig):
+    num_robots: int = 256
+    """Method notes, section 5.9."""
+    course: str | None = None
+    """Preset course or course file; the teacher's by default."""
+    goal_radius: float = 0.45
+    """Distance at which a way-point is reached [m] (method notes, section 5.5)."""
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    frame_steps: int = 1
+    """Control steps between two frames; 1 is 50 Hz (supplement S3)."""
+    latency: tuple[int, int] = (1, 1)
+    """Fewest and most control steps by which images are late: one frame (method notes, section 5.8)."""
+    pitch: float = camera.PITCH_JITTER
+    """Half-width of the mounting angle [rad]: 5 degrees (method notes, section 5.8)."""
+    offset_noise: float = camera.OFFSET_NOISE
+    """Half-width of an image's common error [m]: 0.05 (method notes, section 5.8)."""
+    pixel_noise: float = camera.PIXEL_NOISE
+    """Half-width of its pixels' errors [m], times U(0, 1) for each image: 0.05 (method notes, section 5.8)."""
+
+
+@dataclass(frozen=True)
+class AugmentationConfig:
+    rectangle: float = 0.1
+    """Probability for an image (method notes, section 5.10, as all of these)."""
+    white_noise: float = 0.1
+    white_noise_std: float = 0.02
+    dropout: float = 0.05
+    dropout_share: float = 0.05
+    blur: float = 0.1
+    blur_std: tuple[float, float] = (0.5, 1.5)
+
+
+@dataclass(frozen=True)
+class ImitationConfig:
+    steps: int = 24
+    """Of a window, through which the gradient passes (method notes, section 5.9)."""
+    epochs: int = 1
+    minibatches: int = 1
+    """Of robots; one gradient step an iteration (method notes, section 5.9)."""
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 1e-5
+    decay: int = 20_000
+    """Iterations over which the learning rates fall linearly (method notes, section 5.9)."""
+    max_grad_norm: float = 1.0
+    """Method notes, section 5.9."""
+    behaviour: float = 1.0
+    continuous: float = 1.0
+    heading: float = 1.0
+    obstacle: float = 1.0
+    """Coefficients of the four terms of Eq. (15): all 1 (method notes, section 5.9)."""
+    heading_weights: tuple[float, float] = (2.0, 0.5)
+    """Of the errors to the current and the next way-point (method notes, section 5.9)."""
+    compared: Literal["all", "selected"] = "all"
+    """Whose parameters are compared: of all behaviours (method notes, section 5.9), or of the teacher's choice."""
+    augment: bool = True
+    """Whether the images of the imitation are disturbed too (method notes, section 5.10)."""
+
+
+@dataclass(frozen=True)
+class RepresentationConfig:
+    hidden: int = 1024
+    out_features: int = 64
+    """Sizes of projector and predictor (method notes, section 5.10)."""
+    learning_rate: float = 3e-4
+    final_learning_rate: float = 1e-5
+    """Method notes, section 5.10; falls as that of the imitation does."""
+    decay: float = 0.99
+    """Of the moving average, after every minibatch (method notes, section 5.10)."""
+    images: int = 6144
+    """Of an iteration: all of 256 robots x 24 steps (method notes, section 5.10)."""
+    minibatches: int = 6
+    """Method notes, section 5.10."""
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    images: int = 0
+    """To collect on the course, where the teacher walks, before the imitation begins; 0 for no pre-training (ours).
+    A run that starts from another student does without."""
+    every: int = 2
+    """Decisions between two of them."""
+    epochs: int = 4
+    batch: int = 256
+    learning_rate: float = 1e-3
+    held_out: float = 0.1
+    """Share of the robots whose images measure and do not train."""
+
+
+@dataclass(frozen=True)
+class Config:
+    name: str = "student"
+    """Folder under ``runs``."""
+    runs: Path = Path("runs")
+    seed: int = 0
+    teacher: Path = Path("pretrained/teacher")
+    """Run or artifact folder of the teacher; the student decides as often, on the same behaviours."""
+    bbc: Path | None = None
+    """Run or artifact folder of the Basic Behaviour Controller that the teacher was trained on; found by default."""
+    iterations: int = 15_000
+    """Released code (method notes, section 5.9)."""
+    max_minutes: float | None = None
+    """Stop and save after this time."""
+    checkpoint_every: int = 100
+    resume: Path | None = None
+    """Run folder to go on with."""
+    init_from: Path | None = None
+    """Run or artifact folder whose student to start from."""
+    byol: bool = True
+    """Train the encoder by BYOL too (supplement S2, S8)."""
+    bits: Literal[8, 16] = 8
+    """How images are stored."""
+    memory: int = 512
+    """Units of the GRU (supplement S6)."""
+    encoder_hidden: int = 128
+    """Units of the depth encoder's hidden linear layer (method notes, section 5.9)."""
+    heading_gate: float = HEADING_GATE
+    """Heading errors beyond this are given, not predicted, in training [rad]: 0.6 (method notes, section 5.9)."""
+    env: EnvConfig = field(default_factory=EnvConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+    imitation: ImitationConfig = field(default_factory=ImitationConfig)
+    representation: RepresentationConfig = field(default_factory=RepresentationConfig)
+    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
+    curriculum: CurriculumConfig = field(
+        default_factory=lambda: CurriculumConfig(difficulty=1.0, obstacles=6, practice=0.0)
+    )
+    """Released difficulty at once (method notes, section 5.7)."""
+
+
+PAPER = Config()
+CPU = Config(
+    iterations=1200,
+    max_minutes=240.0,
+    checkpoint_every=25,
+    env=EnvConfig(num_robots=64, randomize=False, push_interval=None),
+    imitation=ImitationConfig(minibatches=4, decay=1200),
+    representation=RepresentationConfig(images=384, minibatches=1),
+    curriculum=CurriculumConfig(difficulty=1.0, obstacles=6, practice=1.0),
+)
+SMOKE = replace(
+    CPU,
+    name="smoke_student",
+    iterations=2,
+    checkpoint_every=1,
+    memory=16,
+    encoder_hidden=8,
+    env=replace(CPU.env, num_robots=4),
+    imitation=replace(CPU.imitation, steps=4, minibatches=2),
+    representation=replace(CPU.representation, images=8, hidden=16),
+    pretrain=PretrainConfig(images=8, every=1, epochs=1, batch=4, held_out=0.25),
+)
+PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}

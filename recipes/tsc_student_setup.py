@@ -1,0 +1,217 @@
+"""What a run of stage 4 is made of: teacher, course with a camera, student, losses, optimisers, and the artifact."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+from rollouts import Controller
+from torch import Tensor
+from torchrl.objectives import SoftUpdate
+from tsc_artifacts import Trained, describe_camera, load_bbc_of, load_trained, trained_bbc
+from tsc_setup import Curriculum, make_env
+from tsc_student_config import AugmentationConfig, Config
+
+from agility_rl import keys
+from agility_rl.collectors import DAggerCollector
+from agility_rl.deploy.artifact import Artifact, ArtifactError, build_manifest
+from agility_rl.envs import AgilityEnv
+from agility_rl.go2 import features
+from agility_rl.losses import BYOLLoss, StudentLoss
+from agility_rl.modules import BYOL, DepthAugmentation, RecurrentStudent, Teacher
+from agility_rl.training.checkpoint import RunCheckpoint
+from agility_rl.training.seeding import Seeds, seed_everything
+
+
+@dataclass
+class Representation:
+    """BYOL around the student's encoder.
+
+    Attributes:
+        loss: online and target network.
+        average: moves the target.
+        optimizer: of the online network, and with it of the encoder.
+    """
+
+    loss: BYOLLoss
+    average: SoftUpdate
+    optimizer: torch.optim.Optimizer
+
+
+@dataclass
+class Components:
+    """Everything a run is made of."""
+
+    seeds: Seeds
+    env: AgilityEnv
+    teacher: Teacher
+    teacher_artifact: Artifact
+    student: RecurrentStudent
+    collector: DAggerCollector
+    curriculum: Curriculum
+    augmentation: DepthAugmentation
+    imitation: StudentLoss
+    optimizer: torch.optim.Optimizer
+    representation: Representation | None
+    bbc: Controller
+
+    @property
+    def generator(self) -> torch.Generator:
+        """Source of minibatch order."""
+        return self.seeds.generator("batches")
+
+    def checkpoint(self, folder: Path, progress: dict[str, float]) -> RunCheckpoint:
+        """All that a bit-exact continuation needs; what is frozen comes from its own artifact."""
+        names = ("seeds", "env", "student", "collector", "curriculum", "optimizer")
+        parts = {name: getattr(self, name) for name in names}
+        if self.representation is not None:
+            parts |= {"byol": self.representation.loss, "byol_optimizer": self.representation.optimizer}
+        return RunCheckpoint(folder, progress=progress, **parts)
+
+
+def resolve(cfg: Config) -> tuple[Config, Trained]:
+    """The teacher, and the options that follow from it.
+
+    Raises:
+        ArtifactError: if it is no teacher, or not the one that a resumed run began with.
+    """
+    trained = load_trained(cfg.teacher, "teacher")
+    if cfg.resume is not None and (manifest := cfg.resume / "policy" / "manifest.json").is_file():
+        began = json.loads(manifest.read_text(encoding="utf-8"))["teacher"]
+        if began != trained.digest:
+            raise ArtifactError(
+                f"{cfg.resume} learns from the teacher {began[:12]}, but {cfg.teacher} holds {trained.digest[:12]}; "
+                "put that one back, or begin another run with --init-from"
+            )
+    course = cfg.env.course or trained.course
+    return replace(cfg, bbc=cfg.bbc or trained_bbc(trained.run), env=replace(cfg.env, course=course)), trained
+
+
+def build(cfg: Config, trained: Trained) -> Components:
+    """Construct course, student, losses and optimisers, from options that :func:`resolve` has completed."""
+    seeds = seed_everything(cfg.seed)
+    teacher = trained.network
+    assert isinstance(teacher, Teacher) and cfg.env.course is not None
+    teacher.requires_grad_(False)
+    controller = load_bbc_of(trained, cfg.bbc)
+    env = make_env(
+        cfg.env,
+        controller,
+        cfg.env.course,
+        trained.decision_steps,
+        goal_radius=cfg.env.goal_radius,
+        depth=asdict(cfg.camera),
+        seed=seeds.integer("environment"),
+    )
+    student = RecurrentStudent.from_teacher(
+        teacher, memory=cfg.memory, encoder_hidden=cfg.encoder_hidden, heading_gate=cfg.heading_gate
+    )
+    student.estimator.requires_grad_(False)  # it estimates what can be measured: imitation shall not bend it
+    # A tenth to a third less time for the convolutions on a CPU.
+    student.depth_encoder.to(memory_format=torch.channels_last)
+    imitation = cfg.imitation
+    return Components(
+        seeds=seeds,
+        env=env,
+        teacher=teacher,
+        teacher_artifact=trained.artifact,
+        student=student,
+        collector=DAggerCollector(
+            env,
+            student.policy(assisted=True),
+            teacher.privileged_policy(),
+            imitation.steps,
+            initial_hidden=student.initial_hidden(env.num_robots),
+            bits=cfg.bits,
+            keep_next=("reward", keys.OUTCOME, keys.TERMINATIONS),
+        ),
+        curriculum=Curriculum.start(cfg.curriculum, env),
+        augmentation=make_augmentation(cfg.augmentation, seeds.generator("augmentation")),
+        imitation=StudentLoss(
+            student.policy(assisted=True, sequence=True),
+            behaviour=imitation.behaviour,
+            continuous=imitation.continuous,
+            heading=imitation.heading,
+            obstacle=imitation.obstacle,
+            compared=imitation.compared,
+            heading_weights=imitation.heading_weights,
+        ),
+        optimizer=torch.optim.Adam(
+            [parameter for parameter in student.parameters() if parameter.requires_grad], lr=imitation.learning_rate
+        ),
+        representation=make_representation(cfg, student) if cfg.byol else None,
+        bbc=controller,
+    )
+
+
+def make_augmentation(cfg: AugmentationConfig, generator: torch.Generator) -> DepthAugmentation:
+    """What disturbs the images of a training."""
+    return DepthAugmentation(generator, **asdict(cfg))
+
+
+def make_representation(cfg: Config, student: RecurrentStudent) -> Representation:
+    """BYOL around the encoder of a student."""
+    own = cfg.representation
+    loss = BYOLLoss(BYOL(student.depth_encoder, hidden=own.hidden, out_features=own.out_features))
+    parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
+    return Representation(loss, SoftUpdate(loss, eps=own.decay), torch.optim.Adam(parameters, lr=own.learning_rate))
+
+
+def load_student(parts: Components, path: Path) -> None:
+    """Start from another run's student.
+
+    Raises:
+        ArtifactError: if it is none, or has other sizes.
+    """
+    trained = load_trained(path, "student")
+    if trained.network.settings != parts.student.settings:
+        raise ArtifactError(
+            f"{trained.artifact.folder}: the student has {trained.network.settings}, this run builds "
+            f"{parts.student.settings}; give the same --memory, --encoder-hidden and "
+            "--heading-gate, and a teacher of the same sizes"
+        )
+    parts.student.load_state_dict(trained.network.state_dict())
+
+
+def annealed(first: float, last: float, iteration: int, length: int) -> float:
+    """Falls linearly from the first to the last value, and stays there."""
+    return first + (last - first) * min(iteration / length, 1.0)
+
+
+def set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
+    """Of all parameters."""
+    for group in optimizer.param_groups:
+        group["lr"] = value
+
+
+def finite(total: Tensor, what: str, iteration: int) -> Tensor:
+    """A loss, if it is a number.
+
+    Raises:
+        ValueError: if it is none; the weights are then still those of the step before.
+    """
+    if not bool(total.isfinite()):
+        raise ValueError(
+            f"the loss of {what} is {total.item()} in iteration {iteration + 1}; nothing was saved since the last "
+            "checkpoint: look for NaN in teacher and images, or --resume from there with a lower learning rate"
+        )
+    return total
+
+
+def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
+    """Write the student as an artifact, with what is needed to run it elsewhere."""
+    manifest = build_manifest(
+        "student",
+        features.CONTROLLER_LAYOUTS,
+        control_period=parts.env.dt * parts.env.decision_steps,
+        data=parts.teacher_artifact.manifest["data"],
+    )
+    manifest["network"] = parts.student.settings
+    manifest["teacher"] = parts.teacher_artifact.manifest["weights"]["sha256"]
+    manifest["bbc"] = parts.bbc.artifact.manifest["weights"]["sha256"]
+    manifest["course"] = cfg.env.course
+    manifest["byol"] = cfg.byol
+    manifest["camera"] = describe_camera() | {"training": asdict(cfg.camera)}
+    Artifact.save(folder / "policy", parts.student.state_dict(), manifest)

@@ -1,0 +1,206 @@
+"""The recipe of stage 4 on a few robots, called in this process: a start of Python costs more than the run."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+
+from agility_rl.deploy.artifact import Artifact
+from agility_rl.go2 import camera
+from agility_rl.modules import RecurrentStudent
+from agility_rl.record.mcap_logger import read_scalars
+
+Module = Callable[[str], ModuleType]
+
+
+@pytest.fixture
+def recipe(module: Module) -> ModuleType:
+    return module("tsc_student")
+
+
+@pytest.fixture
+def smoke(recipe: ModuleType, untrained: Path, untrained_teacher: Path, tmp_path: Path) -> Any:
+    cfg = recipe.PRESETS["smoke"]
+    env = replace(cfg.env, num_threads=1)
+    return replace(cfg, runs=tmp_path, teacher=untrained_teacher, bbc=untrained, env=env, checkpoint_every=10)
+
+
+def test_a_run_writes_a_student_and_what_it_saw(
+    recipe: ModuleType, smoke: Any, untrained: Path, untrained_teacher: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = recipe.train(smoke)
+    artifact = Artifact.load(run / "policy", kind="student")
+    manifest = artifact.manifest
+    assert manifest["control_period"] == pytest.approx(0.04) and manifest["course"] == "bar_jump"  # the teacher's
+    assert manifest["teacher"] == Artifact.load(untrained_teacher / "policy").manifest["weights"]["sha256"]
+    assert manifest["bbc"] == Artifact.load(untrained / "policy").manifest["weights"]["sha256"]
+    assert manifest["camera"]["image"] == [58, 87] and manifest["camera"]["depth_range"] == [0.3, 4.0]
+    assert manifest["camera"]["training"]["latency"] == [1, 1] and manifest["byol"] is True
+    student = RecurrentStudent(**manifest["network"])
+    student.load_state_dict(artifact.state)
+    scalars = read_scalars(run)
+    for name in ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_byol", "spread"):
+        assert bool(scalars[name][1].isfinite().all()) and bool((scalars[name][1] > 0.0).all()), name
+    for name in ("accuracy_behaviour", "accuracy_obstacle", "success/bar_jump", "use/trot", "time/collect"):
+        assert bool(scalars[name][1].isfinite().all()), name
+    assert "success/tunnel" not in scalars and scalars["pretrain/images"][1].tolist() == [6.0]
+    assert "pre-training 1/1 on 6 images; 2 held out" in capsys.readouterr().out
+    saved = json.loads((run / "config.json").read_text())["config"]
+    assert saved["bbc"] == str(untrained) and saved["env"]["course"] == "bar_jump"
+
+
+def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smoke: Any) -> None:
+    whole = recipe.train(replace(smoke, name="whole", iterations=2))
+    halves = recipe.train(replace(smoke, name="halves", iterations=1))
+    recipe.train(replace(smoke, resume=halves, iterations=2))
+    one, other = (Artifact.load(run / "policy").state for run in (whole, halves))
+    assert not [name for name in one if not torch.equal(one[name], other[name])]
+    for name in ("loss_behaviour", "loss_byol", "reward", "use/jump"):
+        assert torch.equal(read_scalars(whole)[name][1], read_scalars(halves)[name][1]), name
+
+
+def test_what_a_step_moves(recipe: ModuleType, module: Module, smoke: Any) -> None:
+    """Imitation moves student and encoder, not the estimator; BYOL the encoder alone; the teacher nothing at all."""
+    setup = module("tsc_student_setup")
+    cfg = replace(smoke, imitation=replace(smoke.imitation, minibatches=1))
+    parts = setup.build(*setup.resolve(cfg))
+    state = {name: value.clone() for name, value in parts.student.state_dict().items()}
+    teacher = {name: value.clone() for name, value in parts.teacher.state_dict().items()}
+
+    def moved() -> set[str]:
+        new = parts.student.state_dict()
+        changed = {name.split(".")[0] for name in state if not torch.equal(new[name], state[name])}
+        state.update({name: value.clone() for name, value in new.items()})
+        return changed
+
+    window = parts.collector.collect()
+    assert window["depth"].dtype == torch.uint8 and moved() == set()
+    images = window["depth"].clone()
+    recipe.imitate(parts, cfg, window, 0)
+    assert moved() == {"depth_encoder", "memory", "actor", "history_encoder"}
+    assert torch.equal(window["depth"], images), "augmentation is for the step, not for the window"
+    recipe.represent_window(parts, cfg, window, 0)
+    assert moved() == {"depth_encoder"}
+    assert all(torch.equal(value, teacher[name]) for name, value in parts.teacher.state_dict().items())
+    parts.env.close()
+
+
+def test_imitation_of_one_window_lowers_its_loss(recipe: ModuleType, module: Module, smoke: Any) -> None:
+    setup = module("tsc_student_setup")
+    own = replace(smoke.imitation, minibatches=1, augment=False, learning_rate=3e-3)
+    cfg = replace(smoke, byol=False, memory=64, imitation=own)
+    parts = setup.build(*setup.resolve(cfg))
+    window = parts.collector.collect()
+    losses = [recipe.imitate(parts, cfg, window, 0) for _ in range(30)]
+    first, last = losses[0], losses[-1]
+    assert parts.representation is None
+    for name in ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle"):
+        assert last[name] < 0.75 * first[name], name
+    parts.env.close()
+
+
+def test_sixteen_bits_without_byol_from_another_student(recipe: ModuleType, smoke: Any) -> None:
+    parent = recipe.train(replace(smoke, iterations=1))
+    nothing = replace(smoke.pretrain, images=0)
+    child = replace(smoke, name="child", init_from=parent, iterations=0, byol=False, bits=16, pretrain=nothing)
+    one, other = (Artifact.load(run / "policy") for run in (parent, recipe.train(child)))
+    assert all(torch.equal(other.state[name], value) for name, value in one.state.items())
+    assert other.manifest["byol"] is False
+    run = recipe.train(replace(child, name="sixteen", iterations=1))
+    assert "loss_byol" not in read_scalars(run) and "loss_behaviour" in read_scalars(run)
+
+
+def test_learning_rates_fall_linearly(module: Module) -> None:
+    annealed = module("tsc_student_setup").annealed
+    assert [annealed(1e-3, 1e-5, n, 100) for n in (0, 50, 100, 500)] == pytest.approx([1e-3, 5.05e-4, 1e-5, 1e-5])
+
+
+def test_the_paper_preset_is_the_papers(module: Module) -> None:
+    """Supplement S2 to S8 and method notes, 5.5 to 5.10, written down once more."""
+    cfg = module("tsc_student_config").PRESETS["paper"]
+    own, byol, disturbed = cfg.imitation, cfg.representation, cfg.augmentation
+    assert (cfg.env.num_robots, own.steps, own.epochs, own.minibatches, cfg.iterations) == (256, 24, 1, 1, 15_000)
+    assert (own.learning_rate, own.final_learning_rate, own.decay, own.max_grad_norm) == (1e-3, 1e-5, 20_000, 1.0)
+    assert own.heading_weights == (2.0, 0.5) and own.compared == "all" and own.augment
+    assert (own.behaviour, own.continuous, own.heading, own.obstacle) == (1.0, 1.0, 1.0, 1.0)
+    assert (byol.hidden, byol.out_features, byol.learning_rate, byol.final_learning_rate) == (1024, 64, 3e-4, 1e-5)
+    assert (byol.images, byol.minibatches, byol.decay) == (256 * 24, 6, 0.99)
+    assert (disturbed.rectangle, disturbed.white_noise, disturbed.white_noise_std) == (0.1, 0.1, 0.02)
+    assert (disturbed.dropout, disturbed.dropout_share, disturbed.blur) == (0.05, 0.05, 0.1)
+    assert disturbed.blur_std == (0.5, 1.5) and (cfg.memory, cfg.heading_gate) == (512, 0.6)
+    assert cfg.camera.latency == (1, 1) and cfg.camera.pitch == pytest.approx(math.radians(5.0))
+    assert (cfg.camera.offset_noise, cfg.camera.pixel_noise, cfg.camera.frame_steps) == (0.05, 0.05, 1)
+    assert (cfg.env.goal_radius, cfg.env.command_noise, cfg.env.push_interval) == (0.45, (0.8, 1.2), 8.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--teacher", "nowhere"), "nowhere: expected the folder of a run"),
+        (("--teacher", "BBC"), "expected a teacher of tsc_teacher.py, got an artifact of kind 'bbc'"),
+        (("--bbc", "TEACHER"), "expected an artifact of kind 'bbc', got 'teacher'"),
+        (("--init-from", "TEACHER"), "expected a student of tsc_student.py, got an artifact of kind 'teacher'"),
+        (("--env.course", "nowhere"), "unknown course 'nowhere'; expected one of full"),
+        (("--representation.images", "2", "--representation.minibatches", "2"), "BYOL needs 2 images or more, got 1"),
+        (("--byo",), "did you mean --byol?"),
+    ],
+)
+def test_bad_options_give_one_clear_line(
+    recipe: ModuleType,
+    smoke: Any,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    options: tuple[str, ...],
+    message: str,
+) -> None:
+    places = {"BBC": str(smoke.bbc), "TEACHER": str(smoke.teacher)}
+    arguments = ["smoke", "--runs", str(tmp_path), "--teacher", str(smoke.teacher), "--bbc", str(smoke.bbc)]
+    arguments += [places.get(option, option) for option in options]
+    with pytest.raises(SystemExit) as stop, recipe.cli.one_line_errors():
+        recipe.train(recipe.cli.from_presets(recipe.PRESETS, arguments))
+    assert stop.value.code == 2
+    errors = capsys.readouterr().err
+    assert message in errors and errors.count("\n") == 1
+
+
+def test_another_camera_another_teacher_and_other_sizes_are_refused(
+    recipe: ModuleType, smoke: Any, module: Module, make_student: Callable[..., Path]
+) -> None:
+    seen = module("tsc_artifacts").describe_camera() | {"image": [60, 106]}
+    wrong = make_student("wrong", camera=seen)
+    with pytest.raises(ValueError, match=r"images of image \[60, 106\], this code's camera has \[58, 87\]"):
+        recipe.train(replace(smoke, init_from=wrong))
+    with pytest.raises(ValueError, match=r"'memory': 16.*give the same --memory"):
+        recipe.train(replace(smoke, name="larger", memory=17, init_from=make_student()))
+    run = recipe.train(replace(smoke, name="mine", iterations=0))
+    other = Artifact.load(smoke.teacher / "policy")
+    weights = {name: value + 1.0 for name, value in other.state.items()}
+    manifest = {name: value for name, value in other.manifest.items() if name != "weights"}
+    Artifact.save(smoke.teacher / "policy", weights, manifest)
+    with pytest.raises(ValueError, match=r"learns from the teacher .{12}, but .* holds .{12}; put that one back"):
+        recipe.train(replace(smoke, resume=run))
+
+
+def test_nan_stops_before_a_step_and_says_where(recipe: ModuleType, module: Module, smoke: Any) -> None:
+    setup = module("tsc_student_setup")
+    parts = setup.build(*setup.resolve(smoke))
+    window = parts.collector.collect()
+    before = {name: value.clone() for name, value in parts.student.state_dict().items()}
+    window["label", "parameters"][0, 0] = math.nan
+    cfg = replace(smoke, imitation=replace(smoke.imitation, minibatches=1))
+    with pytest.raises(ValueError, match="the loss of the imitation is nan in iteration 8; nothing was saved since"):
+        recipe.imitate(parts, cfg, window, 7)
+    assert all(torch.equal(value, before[name]) for name, value in parts.student.state_dict().items())
+    with pytest.raises(ValueError, match="pixels of the depth images are NaN"):
+        camera.normalize_depth(torch.full((58, 87), math.nan))
+    with pytest.raises(ValueError, match="rows and columns are swapped"):
+        recipe.represent(parts, 0, window["depth"].flatten(0, 1).mT)
+    parts.env.close()
