@@ -1,7 +1,7 @@
-"""Run a controller at 50 Hz in real time against a robot: a simulated one in a process of its own, or a Go2 over DDS.
+"""Run a controller at 50 Hz in real time against a robot: a simulated one in a process of its own, or a real one.
 
-The robot stands up, moves in the behaviour that is asked for, stops, and sinks down. Ctrl-C stops it at once, as every
-fault does. The process that runs this is the operator.
+The robot stands up, moves in the behaviour that is asked for, stops, and sinks down; or a person drives it, from a
+browser, a terminal or with a gamepad. Ctrl-C stops it at once, as every fault does.
 
 In:  an artifact folder (or a run), best after recipes/export.py.
 Out: one MCAP file that opens in Foxglove and rerun, and is a robot log for recipes/easi.py.
@@ -9,6 +9,8 @@ Out: one MCAP file that opens in Foxglove and rerun, and is a robot log for reci
     python recipes/deploy.py pretrained/bbc --transport mujoco --seconds 20 --skill trot --speed 1.0
     python recipes/deploy.py pretrained/bbc --transport dds                    # a simulated Go2 that speaks DDS
     python recipes/deploy.py exported/bbc --transport dds --interface eth0     # a real one: docs/deployment.md first
+    python recipes/deploy.py pretrained/bbc --transport lcm                    # a simulated robot, over LCM
+    python recipes/deploy.py pretrained/bbc --operator terminal                # drive it by hand
 
 Status: 0 if all went well, 1 if a fault ended the run or it never began.
 """
@@ -20,12 +22,14 @@ import gc
 import logging
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 import tyro
+from controls import ByHand, ControlsConfig, make_device, task_policy
+from robot_line import RobotConfig, connect
 
 from agility_rl import rotations
 from agility_rl.behaviours import COMMANDS
@@ -33,13 +37,11 @@ from agility_rl.collectors.log_formats import AXES
 from agility_rl.deploy import Artifact, BehaviourCommand, Controller, DeployedBBC, Mode, Operator, SafetyLimits
 from agility_rl.deploy.behaviour import onnx_network, torch_network
 from agility_rl.deploy.controller import StepRecord
-from agility_rl.deploy.dds import DOMAIN, DDSTransport
 from agility_rl.deploy.deadlines import Clock, Durations, MonotonicClock
-from agility_rl.deploy.loopback import LoopbackTransport
-from agility_rl.deploy.robot_process import RobotProcess
-from agility_rl.deploy.transport import Transport
-from agility_rl.deploy.unitree_messages import FootCalibration
+from agility_rl.deploy.operator import Operation, SharedControl
 from agility_rl.go2 import constants, features
+from agility_rl.go2.appearance import dress
+from agility_rl.go2.model import build_spec
 from agility_rl.record import EpisodeRecorder
 from agility_rl.training import cli
 
@@ -54,21 +56,15 @@ READY_SECONDS = 0.5
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(RobotConfig, ControlsConfig):
     artifact: Annotated[Path, tyro.conf.Positional]
     """Artifact folder of a BBC, or a run with one."""
-    transport: Literal["mujoco", "dds"] = "mujoco"
-    """How to reach the robot: a simulated one by packets of our own, or LowCmd and LowState over DDS (extra dds)."""
-    interface: str | None = None
-    """With dds: network interface of a real robot; without one, a simulated robot on the loopback interface."""
-    domain: int = DOMAIN
-    """With dds: domain."""
-    feet: FootCalibration = field(default_factory=FootCalibration)
-    """With dds: from counts of the foot sensors to newtons."""
+    operator: Literal["script", "browser", "terminal", "gamepad"] = "script"
+    """Who drives: a script (stand up, one command, stop), or a person, until the device or Ctrl-C ends it."""
     seconds: float = 20.0
-    """Time in the behaviour, without standing up and sinking down."""
+    """With a script: time in the behaviour, without standing up and sinking down."""
     skill: str = "trot"
-    """Behaviour: walk, pace, trot, canter or jump."""
+    """With a script: walk, pace, trot, canter or jump."""
     speed: float | None = None
     """Forward velocity [m/s], kept inside the behaviour's range (Table S2); its middle by default."""
     yaw_rate: float = 0.0
@@ -79,12 +75,6 @@ class Config:
     """What computes the network; onnx needs an exported artifact and onnxruntime."""
     output: Path | None = None
     """File to record to, ending in .mcap; ``runs/deploy/deploy_N.mcap`` by default. Nothing is overwritten."""
-    pose: Literal["lying", "standing"] = "lying"
-    """How the simulated robot waits."""
-    sim_dt: float = 0.001
-    """Step of the simulated physics and motors [s] (1,000 Hz: supplement S3)."""
-    friction_loss: float | None = None
-    """Dry friction of the simulated joints [N m]; as in training by default."""
     state_age: float = SafetyLimits.state_age
     """Oldest state to act on [s]."""
     missed_deadlines: int = SafetyLimits.missed_deadlines
@@ -224,18 +214,11 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
     path = free_file(Path("runs") / "deploy") if cfg.output is None else cfg.output
     if path.suffix != ".mcap" or path.exists():
         raise ValueError(f"expected --output to be a new file that ends in .mcap, got {path}")
-    if cfg.interface is not None and cfg.transport != "dds":
-        raise ValueError(f"expected --interface only with --transport dds, got --transport {cfg.transport}")
-    friction = artifact.manifest.get("simulation", {}).get("friction_loss", 0.0)
-    robot_options: dict[str, Any] = {
-        "pose": cfg.pose,
-        "sim_dt": cfg.sim_dt,
-        "friction_loss": friction if cfg.friction_loss is None else cfg.friction_loss,
-    }
-    real = cfg.interface is not None
+    cfg.check()
+    robot_options = {} if cfg.real else cfg.options(artifact.manifest)
     metadata = {
         "weights": artifact.manifest["weights"]["sha256"],
-        "robot": {"dds": cfg.interface} if real else robot_options,
+        "robot": {"transport": cfg.transport, "real": cfg.real, **robot_options},
         "versions": cli.versions(),
     }
     limits = SafetyLimits.from_manifest(
@@ -244,17 +227,23 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
         source_age={"operator": cfg.operator_age},
         missed_deadlines=cfg.missed_deadlines,
     )
-    dds = {"domain": cfg.domain} if cfg.transport == "dds" else None
-    simulated = contextlib.nullcontext() if real else RobotProcess(dds=dds, **robot_options)
-    with simulated as robot, EpisodeRecorder(path, dt=bbc.period, metadata=metadata) as episode:
-        if robot is None or dds is not None:
-            transport: Transport = DDSTransport(cfg.interface, domain=cfg.domain, feet=cfg.feet, patience=60.0)
-        else:
-            transport = LoopbackTransport(robot.port, patience=60.0)
+    with contextlib.ExitStack() as stack:
+        device = None
+        if cfg.operator != "script":
+            device = make_device(cfg.operator, cfg, lambda: dress(build_spec()).compile())
+            stack.callback(device.close)
+        transport, robot = stack.enter_context(connect(cfg, robot_options))
+        episode = stack.enter_context(EpisodeRecorder(path, dt=bbc.period, metadata=metadata))
         started = clock.now()
-        operator = Operator(command, started)
-        controller = Controller(transport, bbc, operator, limits=limits, clock=clock)
-        record, procedure = Recorder(episode, bbc), Procedure(controller, operator, cfg.seconds)
+        if device is None:
+            script = Operator(command, started)
+            controller = Controller(transport, bbc, script, limits=limits, clock=clock)
+            procedure: Procedure | ByHand = Procedure(controller, script, cfg.seconds)
+        else:
+            control = SharedControl(task_policy(started), started)
+            controller = Controller(transport, bbc, control, limits=limits, clock=clock)
+            procedure = ByHand(Operation(controller, control, device))
+        record = Recorder(episode, bbc)
 
         def on_step(step: StepRecord) -> None:
             record(step)
@@ -270,7 +259,6 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
                 controller.step()
         finally:
             gc.unfreeze()
-            transport.close()
     print(summary(controller, None if robot is None else robot.lost, started))
     print(f"recorded: {path}, {episode.num_steps} steps")
     return path, controller

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,21 @@ class SimulatorFile:
     def randomization(self) -> Randomization:
         """These simulators for an environment; what they leave open is nominal."""
         return replace(NOMINAL, draw=self.draw)
+
+    def one_robot(self, stiffness: Sequence[float], damping: Sequence[float]) -> dict[str, Any]:
+        """Options of a :class:`agility_rl.deploy.simulated.SimulatedRobot` that is commanded with some gains.
+
+        Raises:
+            ValueError: if something differs that a simulated robot cannot have.
+        """
+        drawn = self.draw(1, torch.Generator().manual_seed(0))
+        if extra := set(drawn) - {"stiffness", "damping"}:
+            raise ValueError(f"expected a simulator that differs in stiffness and damping only, got {sorted(extra)}")
+        factors = {
+            "stiffness_factor": drawn["stiffness"][0] / torch.tensor(stiffness),
+            "damping_factor": drawn["damping"][0] / torch.tensor(damping),
+        }
+        return {name: factor.tolist() for name, factor in factors.items()} | dict(self.model)
 
 
 def load_simulator(path: Path) -> SimulatorFile:

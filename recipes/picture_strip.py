@@ -1,6 +1,6 @@
 """Pictures of an episode: one row a behaviour, frames a few hundredths of a second apart, seen from the robot's side.
 
-In:  an episode (``.mcap``) as ``play.py`` or an EpisodeRecorder writes it.
+In:  an episode (``.mcap``) as ``perform.py`` or an EpisodeRecorder writes it.
 Out: a PNG. Needs a machine that can render: ``MUJOCO_GL=egl`` without a display.
 
     MUJOCO_GL=egl python recipes/picture_strip.py runs/my_run/episodes/play_0.mcap strip.png
@@ -21,6 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from agility_rl import rotations
+from agility_rl.go2.appearance import dress
 from agility_rl.go2.model import build_spec
 from agility_rl.record import read_episode
 from agility_rl.record.episode import read_metadata
@@ -47,23 +48,7 @@ class Config:
 
 def visible_model(skin: Path | None) -> mujoco.MjModel:
     """The Go2 as it should be looked at: without a skin, its collision shapes are what there is to see."""
-    spec = build_spec(skin=skin)
-    if skin is None:
-        for geom in spec.geoms:
-            geom.group = 0
-            if geom.name.endswith(("foot", "calf", "shin")):
-                geom.rgba = [0.15, 0.15, 0.17, 1.0]
-    spec.visual.headlight.ambient = [0.45, 0.45, 0.45]
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.85, 0.9, 0.95],
-        rgb2=[1.0, 1.0, 1.0],
-        width=64,
-        height=64,
-    )
-    return spec.compile()
+    return dress(build_spec(skin=skin)).compile()
 
 
 def rows_of(metadata: dict[str, Any], steps: int) -> list[tuple[str, int, int]]:

@@ -1,196 +1,161 @@
-"""Let a controller perform: an episode for Foxglove or rerun, a picture strip, and MuJoCo's viewer in the browser.
+"""Play with a robot: it stands up in a browser, and the keyboard steers it.
 
-In:  a run or artifact folder; the behaviours to show, one after another.
-Out: ``RUN/episodes/play_N.mcap`` with a Foxglove layout beside it, ``RUN/figures/play_N.png`` where the machine can
-     render; with ``--viewer`` the episode plays in a browser, again and again, until Ctrl-C.
+Plain MuJoCo in real time, driven by what would drive the robot: the controller's state machine, its safety checks, and
+the operator above a policy. Keys are in docs/deployment.md, and on the page.
 
-    python recipes/play.py runs/my_run [--behaviours walk trot jump --seconds 4 --speed 0.8 --viewer]
+In:  an artifact folder, or a run with one; the shipped controller by default.
+Out: nothing but what there is to see. For an episode and pictures: recipes/perform.py.
+
+    python recipes/play.py
+    python recipes/play.py runs/my_run --course bidirectional
+    python recipes/play.py --operator gamepad         # sticks steer, the browser shows
+    python recipes/play.py --operator terminal        # keys in the terminal, no browser: for machines without one
 """
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+import contextlib
+import logging
+import math
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import mujoco
 import torch
 import tyro
-from picture_strip import visible_model
-from rich.console import Console
-from rollouts import Controller, MotionConfig, drive, load_controller, load_motion, make_env
-from torch import Tensor
+from controls import ControlsConfig, make_device, task_policy
 
-from agility_rl import rotations
-from agility_rl.behaviours import BEHAVIOURS, COMMANDS, command_bounds, skill_index
-from agility_rl.go2 import features
-from agility_rl.record import EpisodeRecorder, read_episode
-from agility_rl.record.layout import write_layout
+from agility_rl.deploy import Artifact, Controller, DeployedBBC, Mode, SafetyLimits
+from agility_rl.deploy.behaviour import torch_network
+from agility_rl.deploy.controller import StepRecord
+from agility_rl.deploy.operator import Operation, SharedControl
+from agility_rl.deploy.simulated import SimulatedBus, SimulatedRobot
+from agility_rl.go2.appearance import dress
+from agility_rl.training import cli
 
-MEASURED = ("velocity_x", "velocity_y", "yaw_rate", "height")
+SHIPPED = Path(__file__).parents[1] / "pretrained" / "bbc"
+PUT_BACK = "backspace"
+"""Key that puts the simulated robot back to its start."""
+MOST_BEHIND = 0.1
+"""Time behind real time that is made up for [s]; beyond it, the robot is slower than life."""
 
 
 @dataclass(frozen=True)
-class Config:
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run or artifact folder."""
-    behaviours: tuple[str, ...] = BEHAVIOURS
-    """What to show, in this order."""
-    seconds: float = 4.0
-    """Length of each."""
-    speed: float | None = None
-    """Forward velocity [m/s], kept inside each behaviour's range; the middle of the range by default."""
-    yaw_rate: float = 0.0
-    """Turn rate [rad/s], kept inside each behaviour's range."""
-    strip: bool = True
-    """Render pictures, if this machine can."""
+class Config(ControlsConfig):
+    artifact: Annotated[Path, tyro.conf.Positional] = SHIPPED
+    """Artifact folder of a BBC, or a run with one."""
+    operator: Literal["browser", "terminal", "gamepad"] = "browser"
+    """What steers the robot; with a gamepad, the browser shows it, and its keys work too."""
+    course: str | None = None
+    """Obstacles to stand around the robot: a name of agility_rl.envs.COURSES, such as bidirectional (figure S1)."""
+    pose: Literal["lying", "standing"] = "lying"
+    """How the robot waits."""
     skin: Path | None = None
     """Folder with the meshes of a Go2, for looks."""
-    viewer: bool = False
-    """Show the episode in MuJoCo's browser viewer."""
-    port: int = 0
-    """Port of the viewer; 0 takes the first free one from 8080 on."""
+    seconds: float | None = None
+    """Simulated time after which to end; until Ctrl-C by default."""
     seed: int = 0
-    """Seed of the start state."""
-    output: Path | None = None
-    """Folder for episodes and figures; the run by default."""
-    motion: MotionConfig = field(default_factory=MotionConfig)
+    """Seed of the course."""
 
 
-def command_for(skill: int, speed: float | None, yaw_rate: float) -> Tensor:
-    """Command ``[1, 5]``: the middle of a behaviour's range (Table S2), with a speed and a turn rate if given."""
-    low, high = (bound[skill] for bound in command_bounds())
-    command = (low + high) / 2
-    command[0] = command[0] if speed is None else min(max(speed, float(low[0])), float(high[0]))
-    command[2] = min(max(yaw_rate, float(low[2])), float(high[2]))
-    return command[None]
+class RealTimeBus(SimulatedBus):
+    """Simulated time that passes no faster than real time, and slower where the machine cannot keep up."""
+
+    def __init__(self, robot: SimulatedRobot) -> None:
+        super().__init__(robot)
+        self._origin = time.monotonic()
+
+    def sleep_until(self, moment: float) -> None:
+        """Advance the physics, then wait until as much real time has passed."""
+        behind = time.monotonic() - self._origin - self.now()
+        self._origin += max(0.0, behind - MOST_BEHIND)
+        super().sleep_until(moment)
+        time.sleep(max(0.0, self._origin + self.now() - time.monotonic()))
 
 
-def free_name(folder: Path) -> str:
-    """``play_N`` with the first N that no episode has."""
-    number = 0
-    while (folder / f"play_{number}.mcap").exists():
-        number += 1
-    return f"play_{number}"
+class Start:
+    """Takes the robot from its start to a run by itself, and back to the start when the operator says so."""
 
+    def __init__(self, operation: Operation, robot: SimulatedRobot, pose: str) -> None:
+        self.operation, self.robot, self.pose = operation, robot, pose
+        self._left: list[Mode] = [Mode.STAND_UP, Mode.RUN]
 
-def perform(controller: Controller, config: Config, path: Path) -> str | None:
-    """Drive one robot and write the episode; returns when and in which behaviour it fell, if it did."""
-    motion = load_motion(config.motion, controller.trained, config.seed)
-    env = make_env(1, controller, motion.start_states(config.seed), num_threads=1, seed=config.seed)
-    skills = [skill_index(name) for name in config.behaviours]
-    steps = max(1, round(config.seconds / env.dt))
-    schedule = [(steps, torch.tensor([skill]), command_for(skill, config.speed, config.yaw_rate)) for skill in skills]
-    pieces = [(name, index * steps, steps) for index, name in enumerate(config.behaviours)]
-    metadata = {"pieces": pieces, "weights": controller.artifact.manifest["weights"]["sha256"], "seed": config.seed}
-    fall: str | None = None
-    simulator = env.simulator
-    with EpisodeRecorder(path, dt=env.dt, metadata=metadata) as recorder:
-        for step, td in enumerate(drive(controller.bbc, env, schedule)):
-            name = config.behaviours[step // steps]
-            if fall is None and bool(td["terminated"]):
-                fall = f"{name}, after {step * env.dt:.2f} s"
-            velocity = rotations.rotate_inverse(simulator.root_quaternion, simulator.root_linear_velocity)[0]
-            turn, height = simulator.root_angular_velocity[0, 2], simulator.root_position[0, 2]
-            measured = (velocity[0], velocity[1], turn, height)
-            recorder.record(
-                simulator.root_position[0],
-                simulator.root_quaternion[0],
-                simulator.joint_position[0],
-                joint_velocity=simulator.joint_velocity[0],
-                foot_contact=simulator.contact_force[0, 1:].unflatten(-1, (4, 4))[:, 3] > features.FOOT_CONTACT_FORCE,
-                signals={
-                    "command": dict(zip(COMMANDS, schedule[step // steps][2][0].tolist(), strict=True)),
-                    "behaviour": {"name": name},
-                    "measured": dict(zip(MEASURED, (float(value) for value in measured), strict=True)),
-                },
-            )
-    env.close()
-    return fall
-
-
-def render(episode: Path, picture: Path, skin: Path | None) -> str | None:
-    """Draw the picture strip in a process of its own; returns why it could not, if so.
-
-    MuJoCo chooses its graphics library when it is imported, and a broken driver may end the process.
-    """
-    environment = dict(os.environ)
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        environment.setdefault("MUJOCO_GL", "egl")
-    command = [sys.executable, str(Path(__file__).with_name("picture_strip.py")), str(episode), str(picture)]
-    command += ["--skin", str(skin)] if skin else []
-    result = subprocess.run(command, env=environment, capture_output=True, text=True)
-    if result.returncode == 0:
-        return None
-    return (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]
-
-
-def show(episode: Path, skin: Path | None, port: int) -> None:
-    """Play an episode in MuJoCo's browser viewer, again and again, until it is closed or Ctrl-C."""
-    from mujoco.studio import app, launch_web, viewer_protocol
-
-    recorded = read_episode(episode)
-    pose = torch.cat([recorded[name] for name in ("root_position", "root_quaternion", "joint_position")], -1).numpy()
-    period = float(recorded["time"][1] - recorded["time"][0]) if len(pose) > 1 else 0.02
-    model = visible_model(skin)
-    data = mujoco.MjData(model)
-    settings = viewer_protocol.ViewerConfig(title=episode.stem, gfx="web", http_port=port, open_browser=True)
-    with launch_web.launch(settings, plugins=[app.App()]) as handle:
-        handle.set_model(model, data=data)
-        try:
-            while True:
-                for row in pose:
-                    begin = time.monotonic()
-                    if not handle.is_running():
-                        return
-                    data.qpos[:] = row
-                    mujoco.mj_forward(model, data)
-                    handle.sync()
-                    time.sleep(max(0.0, period - (time.monotonic() - begin)))
-        except KeyboardInterrupt:
+    def __call__(self, step: StepRecord) -> None:
+        """Ask for the next mode, once somebody is there to see it."""
+        controller = self.operation.controller
+        if PUT_BACK in self.operation.others:
+            controller.request(Mode.DAMPING)
+            self._left = [Mode.PASSIVE, Mode.STAND_UP, Mode.RUN]
             return
+        if self.operation.asked:
+            self._left = []
+        if not self._left or not self.operation.device.connected():
+            return
+        waits_in = {Mode.PASSIVE: Mode.DAMPING, Mode.STAND_UP: Mode.PASSIVE, Mode.RUN: Mode.READY}
+        if step.mode is waits_in[self._left[0]]:
+            if self._left[0] is Mode.PASSIVE:
+                self.robot.reset(self.pose)
+            controller.request(self._left.pop(0))
 
 
-def main(config: Config, console: Console) -> Path:
-    """Perform, record, draw, show; returns the episode."""
-    if not config.behaviours or config.seconds <= 0:
-        raise ValueError("expected at least one of --behaviours and --seconds above 0")
-    for name in config.behaviours:
-        skill_index(name)
-    controller = load_controller(config.run)
-    output = config.output or controller.run
-    name = free_name(output / "episodes")
-    episode = output / "episodes" / f"{name}.mcap"
-    fall = perform(controller, config, episode)
-    plots = {
-        f"{title}": [f"/command.{key}", f"/measured.{key}"]
-        for title, key in zip(
-            ("Forward velocity [m/s]", "Lateral velocity [m/s]", "Yaw rate [rad/s]"), MEASURED[:3], strict=True
-        )
-    }
-    plots["Trunk height [m]"] = ["/command.locomotion_height", "/command.jump_height", "/measured.height"]
-    layout = write_layout(episode.parent, plots)
-    console.print(f"{episode}: {', '.join(config.behaviours)}; " + (f"fell in {fall}" if fall else "no fall"))
-    console.print(f"{layout}: import it in Foxglove beside the episode")
-    if config.strip:
-        picture = output / "figures" / f"{name}.png"
-        reason = render(episode, picture, config.skin)
-        console.print(
-            f"{picture}" if reason is None else f"no pictures, this machine cannot render: {reason}", markup=False
-        )
-    if config.viewer:
-        show(episode, config.skin, config.port)
-    return episode
+def load(folder: Path) -> DeployedBBC:
+    """The controller, ready to run."""
+    artifact = Artifact.load(folder / "policy" if (folder / "policy").is_dir() else folder, kind="bbc")
+    return DeployedBBC(torch_network(artifact), artifact)
+
+
+def surroundings(cfg: Config) -> Callable[[mujoco.MjSpec], object]:
+    """What stands around the robot, and how all of it looks."""
+    if cfg.course is None:
+        return dress
+    from play_course import surround  # the environments take seconds to import
+
+    course = surround(cfg.course, cfg.seed)
+
+    def add(spec: mujoco.MjSpec) -> None:
+        course(spec)
+        dress(spec)
+
+    return add
+
+
+def play(cfg: Config, interrupted: Callable[[], bool]) -> Controller:
+    """Until interrupted, or for some simulated time."""
+    bbc = load(cfg.artifact)
+    friction = bbc.manifest.get("simulation", {}).get("friction_loss", 0.0)
+    robot = SimulatedRobot(friction_loss=friction, skin=cfg.skin, surround=surroundings(cfg))
+    robot.reset(cfg.pose)
+    keys = {PUT_BACK.capitalize(): "back to the start"}
+    with contextlib.closing(make_device(cfg.operator, cfg, lambda: robot.model, keys)) as device:
+        bus = RealTimeBus(robot)
+        control = SharedControl(task_policy(bus.now()), bus.now())
+        # Nobody is hurt by a simulated robot whose operator looks away.
+        ages = {**SafetyLimits().source_age, "operator": math.inf}
+        limits = SafetyLimits.from_manifest(bbc.manifest, source_age=ages)
+        controller = Controller(bus, bbc, control, limits=limits, clock=bus)
+        operation = Operation(controller, control, device, pose=lambda: robot.data.qpos.tolist())
+        start = Start(operation, robot, cfg.pose)
+
+        def on_step(step: StepRecord) -> None:
+            operation(step)
+            start(step)
+
+        controller.on_step = on_step
+        controller.run(seconds=cfg.seconds, until=lambda: interrupted() or device.ended())
+    return controller
+
+
+def main(cfg: Config) -> None:
+    """Play until Ctrl-C."""
+    logging.getLogger("agility_rl.deploy").setLevel(logging.ERROR)  # what happens is on the page
+    torch.set_num_threads(1)
+    with cli.interruptible() as interrupted:
+        play(cfg, interrupted)
 
 
 if __name__ == "__main__":
-    screen = Console(soft_wrap=True, highlight=False)
-    try:
-        main(tyro.cli(Config, description=__doc__), screen)
-    except (ValueError, OSError) as error:
-        screen.print(f"[red]error[/] {error}")
-        sys.exit(2)
+    with cli.one_line_errors():
+        main(tyro.cli(Config, description=__doc__))

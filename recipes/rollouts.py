@@ -1,4 +1,4 @@
-"""What ``evaluate.py`` and ``play.py`` share: load a controller and its motion, drive robots, record what they do."""
+"""What ``evaluate.py`` and ``perform.py`` share: load a controller and its motion, drive robots, record them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from agility_rl import rotations
 from agility_rl.behaviours import NUM_BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.envs import LocomotionEnv
-from agility_rl.go2 import features
+from agility_rl.go2 import constants, features
 from agility_rl.go2.kinematics import forward
 from agility_rl.modules import BasicBehaviourController
 from agility_rl.motion import MotionClip, MotionDataset, load_clips
@@ -164,6 +164,27 @@ def drive(bbc: BasicBehaviourController, env: LocomotionEnv, schedule: Schedule)
             yield td
 
 
+def recorded_step(
+    position: Tensor,
+    turn: Tensor,
+    velocity: Tensor,
+    turn_rate: Tensor,
+    joint_position: Tensor,
+    foot_force: Tensor,
+) -> tuple[Tensor, ...]:
+    """Steps of a :class:`Recording`, ``[N, ...]`` each, of states; the turn rate is in the base frame."""
+    heading = rotations.heading(turn)
+    feet = rotations.rotate(turn[:, None], forward(joint_position))
+    return (
+        rotations.rotate_inverse(heading[:, None], feet),
+        contacts(feet + position[:, None]),
+        foot_force > features.FOOT_CONTACT_FORCE,
+        position[:, 2],
+        rotations.rotate_inverse(heading, velocity),
+        rotations.rotate(turn, turn_rate)[:, 2],
+    )
+
+
 def record(bbc: BasicBehaviourController, env: LocomotionEnv, schedule: Schedule) -> Recording:
     """Drive robots and keep only what gait analysis needs."""
     rows: list[tuple[Tensor, ...]] = []
@@ -171,20 +192,17 @@ def record(bbc: BasicBehaviourController, env: LocomotionEnv, schedule: Schedule
     simulator = env.simulator
     for td in drive(bbc, env, schedule):
         fell |= td["terminated"][:, 0]
-        turn, position = simulator.root_quaternion, simulator.root_position
-        heading = rotations.heading(turn)
-        feet = rotations.rotate(turn[:, None], forward(simulator.joint_position))
         rows.append(
-            (
-                rotations.rotate_inverse(heading[:, None], feet),
-                contacts(feet + position[:, None]),
-                simulator.contact_force[:, 1:].unflatten(-1, (4, 4))[..., 3] > features.FOOT_CONTACT_FORCE,
-                position[:, 2],
-                rotations.rotate_inverse(heading, simulator.root_linear_velocity),
-                rotations.rotate(turn, simulator.root_angular_velocity)[:, 2],
+            recorded_step(
+                simulator.root_position,
+                simulator.root_quaternion,
+                simulator.root_linear_velocity,
+                simulator.root_angular_velocity,
+                simulator.joint_position,
+                simulator.contact_force[:, list(constants.FOOT_GROUPS)],
             )
         )
-    return Recording(*(torch.stack(column, 1) for column in zip(*rows, strict=True)), fell)
+    return Recording(*[torch.stack(column, 1) for column in zip(*rows, strict=True)] + [fell])
 
 
 def join(parts: Sequence[Recording]) -> Recording:

@@ -8,6 +8,7 @@ from agility_rl.deploy.behaviour import DeployedBBC
 from agility_rl.deploy.commander import BehaviourCommand, Commander, Operator
 from agility_rl.deploy.controller import Controller, Mode
 from agility_rl.deploy.depth import DepthPreprocessor
+from agility_rl.deploy.operator import SharedControl
 from agility_rl.deploy.safety import SafetyLimits
 from agility_rl.deploy.transport import JointCommand, RobotState, Transport
 
@@ -23,5 +24,6 @@ __all__ = [
     "Operator",
     "RobotState",
     "SafetyLimits",
+    "SharedControl",
     "Transport",
 ]

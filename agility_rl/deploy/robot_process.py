@@ -158,6 +158,7 @@ class RobotProcess:
         port: to listen on; 0 takes a free one.
         dds: speak as a Go2 over DDS instead: keyword arguments ``interface`` and ``domain`` of
             :class:`agility_rl.deploy.dds.DDSRobot`; :attr:`port` is then 0.
+        lcm: speak over LCM instead: keyword argument ``url`` of :class:`agility_rl.deploy.lcm.LCMRobot`; likewise.
         **robot_options: keyword arguments of :class:`agility_rl.deploy.simulated.SimulatedRobot`, as JSON values.
 
     Attributes:
@@ -169,9 +170,15 @@ class RobotProcess:
     """
 
     def __init__(
-        self, *, pose: str = "lying", port: int = 0, dds: dict[str, Any] | None = None, **robot_options: Any
+        self,
+        *,
+        pose: str = "lying",
+        port: int = 0,
+        dds: dict[str, Any] | None = None,
+        lcm: dict[str, Any] | None = None,
+        **robot_options: Any,
     ) -> None:
-        options = {"pose": pose, "port": port, "dds": dds, **robot_options}
+        options = {"pose": pose, "port": port, "dds": dds, "lcm": lcm, **robot_options}
         command = [sys.executable, "-m", __name__, json.dumps(options)]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
@@ -208,17 +215,21 @@ class RobotProcess:
 
 def serve_on(line: dict[str, Any], robot: SimulatedRobot) -> tuple[Served, int]:
     """The robot's end of the line that was asked for, and its port."""
-    if line["dds"] is None:
-        server = RobotServer(robot, line["port"])
-        return server, server.port
-    from agility_rl.deploy.dds import DDSRobot  # only who uses DDS needs it
+    if line["dds"] is not None:
+        from agility_rl.deploy.dds import DDSRobot  # only who uses DDS needs it
 
-    return DDSRobot(robot, **line["dds"]), 0
+        return DDSRobot(robot, **line["dds"]), 0
+    if line["lcm"] is not None:
+        from agility_rl.deploy.lcm import LCMRobot
+
+        return LCMRobot(robot, **line["lcm"]), 0
+    server = RobotServer(robot, line["port"])
+    return server, server.port
 
 
 def main(options: dict[str, Any]) -> None:
     """Body of the process: says its port, and ends when its input is closed, also by the death of who started it."""
-    pose, line = options.pop("pose"), {name: options.pop(name) for name in ("port", "dds")}
+    pose, line = options.pop("pose"), {name: options.pop(name) for name in ("port", "dds", "lcm")}
     robot = SimulatedRobot(**options)
     robot.reset(pose)
     robot.advance(SETTLE_SECONDS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -36,6 +36,9 @@ class SimulatedRobot:
     Args:
         sim_dt: physics step [s].
         command_timeout: time without a command after which the motors damp [s]; ``None`` never.
+        stiffness_factor: true stiffness of the motors as a multiple of the commanded, one number or twelve.
+        damping_factor: likewise; a robot is not what its data sheet says.
+        surround: called with the robot's spec before it is compiled, to add what stands around it.
         **model_options: keyword arguments of :func:`agility_rl.go2.model.build_spec`.
 
     Attributes:
@@ -51,11 +54,21 @@ class SimulatedRobot:
     """
 
     def __init__(
-        self, *, sim_dt: float = SIM_DT, command_timeout: float | None = COMMAND_TIMEOUT, **model_options: Any
+        self,
+        *,
+        sim_dt: float = SIM_DT,
+        command_timeout: float | None = COMMAND_TIMEOUT,
+        stiffness_factor: float | Sequence[float] = 1.0,
+        damping_factor: float | Sequence[float] = 1.0,
+        surround: Callable[[mujoco.MjSpec], object] = lambda spec: None,
+        **model_options: Any,
     ) -> None:
-        self.model: Any = build_spec(sim_dt=sim_dt, **model_options).compile()
+        spec = build_spec(sim_dt=sim_dt, **model_options)
+        surround(spec)
+        self.model: Any = spec.compile()
         self.data: Any = mujoco.MjData(self.model)
         self.sim_dt, self.command_timeout = sim_dt, command_timeout
+        self._factors = np.asarray(stiffness_factor, np.float32), np.asarray(damping_factor, np.float32)
         self._sequence = 0
         self.reset()
 
@@ -82,15 +95,15 @@ class SimulatedRobot:
     def place(self, qpos: np.ndarray, qvel: np.ndarray, command: JointCommand | None = None) -> None:
         """Put the robot into a state of the engine, ``[19]`` and ``[18]``; without a command, the motors damp."""
         mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        self.data.qpos[: len(qpos)], self.data.qvel[: len(qvel)] = qpos, qvel  # moving obstacles come behind
         self.command(JointCommand.damped(DAMPING_GAIN) if command is None else command)
         mujoco.mj_forward(self.model, self.data)
 
     def command(self, command: JointCommand) -> None:
         """Give the motors a new command."""
-        stiffness, damping = command.stiffness.numpy(), command.damping.numpy()
+        stiffness, damping = self._factors[0] * command.stiffness.numpy(), self._factors[1] * command.damping.numpy()
         self.model.actuator_gainprm[:, 0] = stiffness
-        self.model.actuator_biasprm[:, 0] = (command.torque + command.damping * command.velocity).numpy()
+        self.model.actuator_biasprm[:, 0] = command.torque.numpy() + damping * command.velocity.numpy()
         self.model.actuator_biasprm[:, 1] = -stiffness
         self.model.actuator_biasprm[:, 2] = -damping
         self.data.ctrl[:] = command.position.numpy()

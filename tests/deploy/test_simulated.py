@@ -11,6 +11,7 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from agility_rl import keys
+from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.deploy.behaviour import DeployedBBC, torch_network
 from agility_rl.deploy.commander import BehaviourCommand, Operator
@@ -43,6 +44,20 @@ def test_motors_follow_their_law() -> None:
         -torch.tensor(constants.TORQUE_LIMIT), torch.tensor(constants.TORQUE_LIMIT)
     )
     assert torch.allclose(robot.state(0.0).joint_torque, expected, atol=1e-4)
+
+
+def test_motors_may_be_stiffer_than_they_are_told() -> None:
+    generator = torch.Generator().manual_seed(0)
+    position, stiffness, damping, velocity, torque = torch.rand(5, 12, generator=generator)
+    factor = torch.linspace(0.5, 2.0, 12)
+    robot = SimulatedRobot(stiffness_factor=factor.tolist(), damping_factor=1.5)
+    robot.reset("lying")
+    robot.command(JointCommand(position - 1.0, 10 * stiffness, damping, velocity, torque))
+    before = robot.state(0.0)
+    robot.advance(robot.sim_dt)
+    true = JointCommand(position - 1.0, 10 * stiffness * factor, 1.5 * damping, velocity, torque)
+    limit = torch.tensor(constants.TORQUE_LIMIT)
+    assert torch.allclose(robot.state(0.0).joint_torque, pd_torque(true, before).clamp(-limit, limit), atol=1e-4)
 
 
 def test_without_commands_the_motors_damp() -> None:
@@ -95,7 +110,7 @@ def same_start(env: LocomotionEnv, robot: SimulatedRobot) -> None:
     robot.place(qpos, env.simulator._qvel[0].copy(), start)
 
 
-@pytest.mark.parametrize("behaviour", ["trot", "jump"])
+@pytest.mark.parametrize("behaviour", BEHAVIOURS)
 def test_sim_to_sim(repository: Path, behaviour: str) -> None:
     """The shipped controller in plain MuJoCo acts as in the training environment, from the same state."""
     artifact = Artifact.load(repository / "pretrained" / "bbc", kind="bbc")

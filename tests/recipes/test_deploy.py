@@ -15,6 +15,7 @@ import torch
 from agility_rl.collectors import RobotLog
 from agility_rl.deploy import BehaviourCommand, Mode, RobotState
 from agility_rl.deploy.controller import StepRecord
+from agility_rl.deploy.lcm import address, connect
 from agility_rl.deploy.transport import JointCommand
 from agility_rl.go2 import constants
 from agility_rl.record import EpisodeRecorder, read_episode
@@ -69,9 +70,41 @@ def test_the_same_controller_drives_a_robot_that_speaks_dds(
     assert standing[constants.JOINT_NAMES.index("FL_calf_joint")] < -1.0, "our joints, in our order"
 
 
-def test_an_interface_is_one_of_dds(deploy: ModuleType, untrained: Path, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="--interface only with --transport dds, got --transport mujoco"):
-        deploy.main(deploy.Config(untrained, interface="eth0", output=tmp_path / "run.mcap"))
+def test_and_over_lcm_a_robot_that_is_softer_than_it_is_told(
+    deploy: ModuleType, module: Module, untrained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("lcm", reason="needs the extra lcm")
+    record = module("record_log")
+    truth = record.Truth(**{f"{link}_stiffness": 0.75 for link in constants.LINKS})
+    soft = record.main(record.Config(log=tmp_path / "t.csv", steps=200, truth=truth)).with_suffix(".truth.json")
+    patient = {"state_age": 600.0, "operator_age": 600.0, "missed_deadlines": 10**9}
+    path, domain = tmp_path / "run.mcap", 1 + os.getpid() % 900
+    try:
+        connect(address(domain))
+    except ConnectionError as error:
+        pytest.skip(str(error))
+    cfg = deploy.Config(
+        untrained, transport="lcm", domain=domain, simulator=soft, seconds=1.0, output=path, pose="standing", **patient
+    )
+    assert deploy.main(cfg) == 0, capsys.readouterr().out
+    assert "run        requested" in capsys.readouterr().out
+    log, episode = RobotLog.load(path), read_episode(path)
+    assert len(log.transitions()) > 0
+    first = int((episode["controller/estimated_height"] != 0.0).int().argmax())  # until then it stood
+    position, torque = (episode[name][first - 15 : first].mean(0) for name in ("joint_position", "joint_torque"))
+    found = torque / (torch.tensor(constants.DEFAULT_POSE) - position)
+    knees = [constants.JOINT_NAMES.index(f"{leg}_calf_joint") for leg in constants.LEGS]
+    assert found[knees].tolist() == pytest.approx([30.0] * 4, rel=0.05), "three quarters of what it is told"
+
+
+def test_an_option_of_another_transport_is_named(deploy: ModuleType, untrained: Path, tmp_path: Path) -> None:
+    for options, message in (
+        ({"interface": "eth0"}, "--interface only with --transport dds, got --transport mujoco"),
+        ({"ttl": 1}, "--ttl only with --transport lcm, got --transport mujoco"),
+        ({"ttl": 1, "transport": "lcm", "simulator": tmp_path}, "--simulator only with a simulated robot, got a real"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            deploy.main(deploy.Config(untrained, output=tmp_path / "run.mcap", **options))
 
 
 def test_a_file_is_never_overwritten_and_a_bad_name_is_named(

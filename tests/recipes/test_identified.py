@@ -10,6 +10,8 @@ from types import ModuleType
 import pytest
 import torch
 
+from agility_rl.deploy.simulated import SimulatedRobot
+from agility_rl.deploy.transport import JointCommand
 from agility_rl.envs.randomization import sample_parameters
 
 Module = Callable[[str], ModuleType]
@@ -84,3 +86,24 @@ def test_bad_files_are_refused(module: Module, tmp_path: Path, text: str | None,
         (tmp_path / "result.json").write_text(text)
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         module("identified").load_simulator(tmp_path / "result.json")
+
+
+def test_one_robot_has_the_gains_of_the_file(module: Module, result: Path, untrained: Path, tmp_path: Path) -> None:
+    record = module("record_log")
+    truth = record.Truth(hip_stiffness=1.25, calf_damping=0.5)
+    cfg = record.Config(log=tmp_path / "t.csv", steps=200, truth=truth, contact_time=0.03)
+    file = record.main(cfg).with_suffix(".truth.json")
+    commanded = [40.0] * 12, [2.0] * 12
+    options = module("identified").load_simulator(file).one_robot(*commanded)
+    assert options["stiffness_factor"] == [1.25, 1.0, 1.0] * 4
+    assert options["damping_factor"] == [0.5, 0.5, 0.25] * 4, "nominal is 1, and 2 is commanded"
+    assert options["contact_time"] == 0.03 and options["cone"] == "pyramidal"
+    robot = SimulatedRobot(**options)
+    robot.command(JointCommand(torch.zeros(12), *(torch.tensor(values) for values in commanded)))
+    assert robot.model.actuator_gainprm[:3, 0].tolist() == [50.0, 40.0, 40.0]
+    assert robot.model.actuator_biasprm[:3, 2].tolist() == [-1.0, -1.0, -0.5]
+    content = json.loads(file.read_text())
+    content["parameters"]["trunk_mass_offset"] = {"value": 1.0, "unit": "kg", "multiple": None}
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"stiffness and damping only, got \['.*mass.*'\]"):
+        module("identified").load_simulator(file).one_robot(*commanded)
