@@ -15,7 +15,6 @@ Presets: ``smoke`` (seconds), ``quickstart`` (about five minutes), ``cpu`` (unde
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +26,7 @@ from bbc_setup import ANCHORED, Components, build, policy_folder, save_policy
 from held_fixed import infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import run
+from training_run import Laps, run
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
@@ -209,14 +208,7 @@ def train(cfg: Config) -> Path:
 
 def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     """One iteration of Algorithm S1; returns metrics by name."""
-    clock = time.perf_counter()
-    times = {}
-
-    def lap(name: str) -> None:
-        nonlocal clock
-        now = time.perf_counter()
-        times[f"time/{name}"], clock = now - clock, now
-
+    lap = Laps()
     cfg = at(cfg, iteration)
     parts.ppo.loss.entropy_coeff.fill_(cfg.ppo.entropy)
     if parts.ppo.schedule is not None:
@@ -268,7 +260,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     metrics |= {f"task/{name}": value.mean() for name, value in batch["next", keys.REWARD_TERMS].items()}
     metrics |= {f"prior/{name}": p for name, p in zip(BEHAVIOURS, parts.prior.probabilities, strict=True)}
     metrics["falls_per_minute"] = batch["next", "terminated"].float().mean() * 60.0 / parts.env.dt
-    return {name: float(value) for name, value in metrics.items()} | times
+    return {name: float(value) for name, value in metrics.items()} | lap.metrics
 
 
 if __name__ == "__main__":

@@ -30,6 +30,23 @@ class RunConfig(Protocol):
     def resume(self) -> Path | None: ...
 
 
+class Laps:
+    """Seconds of the parts of an iteration, as metrics ``time/NAME``.
+
+    Attributes:
+        metrics: of the laps so far.
+    """
+
+    def __init__(self) -> None:
+        self.metrics: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def __call__(self, name: str) -> None:
+        """A part ends here, and the next begins."""
+        now = time.perf_counter()
+        self.metrics[f"time/{name}"], self._last = now - self._last, now
+
+
 def run(
     recipe: str,
     cfg: RunConfig,

@@ -17,7 +17,6 @@ Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper``. Ctrl-C ends the it
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from course_metrics import judge, set_course
 from encoder_pretraining import pretrain
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import run
+from training_run import Laps, run
 from tsc_student_config import PRESETS, Config
 from tsc_student_setup import (
     Components,
@@ -93,14 +92,7 @@ def represent_window(parts: Components, cfg: Config, window: TensorDictBase, ite
 
 def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     """One iteration of Algorithm S3's second loop; returns metrics by name."""
-    clock = time.perf_counter()
-    times = {}
-
-    def lap(name: str) -> None:
-        nonlocal clock
-        now = time.perf_counter()
-        times[f"time/{name}"], clock = now - clock, now
-
+    lap = Laps()
     own, byol = cfg.imitation, parts.representation
     rate = annealed(own.learning_rate, own.final_learning_rate, iteration, own.decay)
     set_learning_rate(parts.optimizer, rate)
@@ -122,8 +114,8 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         lap("byol")
     metrics["reward"] = window["next", "reward"].mean()
     metrics["learning_rate"] = rate
-    metrics["time/images_per_second"] = window.numel() / sum(times.values())
-    return {name: float(value) for name, value in metrics.items()} | times
+    metrics["time/images_per_second"] = window.numel() / sum(lap.metrics.values())
+    return {name: float(value) for name, value in metrics.items()} | lap.metrics
 
 
 def check(cfg: Config) -> None:

@@ -14,7 +14,6 @@ Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper``.
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from course_metrics import judge, set_course
 from held_fixed import infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import run
+from training_run import Laps, run
 from tsc_config import PRESETS, Config
 from tsc_setup import Components, build, save_policy
 
@@ -74,14 +73,7 @@ def update_adaptation(parts: Components, minibatches: int, batch: TensorDictBase
 
 def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     """One iteration of Algorithm S3's first loop; returns metrics by name."""
-    clock = time.perf_counter()
-    times = {}
-
-    def lap(name: str) -> None:
-        nonlocal clock
-        now = time.perf_counter()
-        times[f"time/{name}"], clock = now - clock, now
-
+    lap = Laps()
     set_course(parts.env, parts.curriculum)
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     policy = parts.teacher.deployable_policy() if with_history else parts.teacher.privileged_policy()
@@ -106,7 +98,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     lap("adaptation")
     metrics |= {f"task/{name}": value.mean() for name, value in batch["next", keys.REWARD_TERMS].items()}
     metrics["std"] = parts.teacher.actor.network.parameters_head.std.detach().mean()
-    return {name: float(value) for name, value in metrics.items()} | times
+    return {name: float(value) for name, value in metrics.items()} | lap.metrics
 
 
 def train(cfg: Config) -> Path:
