@@ -20,8 +20,10 @@ STRIDE = 0.5
 CLEARANCE = 0.005
 """Height added at a reset, so that no foot starts in the ground [m]."""
 
-_BUFFERS = ("action", "torque", "joint_velocity", "mean_velocity", "mean_yaw_rate", "heights", "privileged")
-_BUFFERS += ("stiffness", "damping")
+_BUFFERS = (
+    *("action", "torque", "joint_velocity", "mean_velocity", "mean_yaw_rate"),
+    *("heights", "privileged", "stiffness", "damping"),
+)
 
 
 class Robots:
