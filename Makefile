@@ -40,4 +40,4 @@ format: setup
 
 test: lint
 	@mkdir -p build
-	$(PYTHON) -m pytest -n 2 --junitxml=build/tests.xml $(PYTEST_ARGS)
+	$(PYTHON) -m pytest -n 2 --dist worksteal --junitxml=build/tests.xml $(PYTEST_ARGS)
