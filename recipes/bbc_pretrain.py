@@ -22,7 +22,7 @@ import torch
 from bbc_cloning import clone_behaviour
 from bbc_config import Config, ImitationConfig, at, check_changes
 from bbc_presets import PRESETS
-from bbc_setup import ANCHORED, Components, build, policy_folder, save_policy
+from bbc_setup import ANCHORED, Components, build, save_policy
 from held_fixed import infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -188,7 +188,7 @@ def train(cfg: Config) -> Path:
     def begin() -> None:
         warm_up_predictor(parts, cfg.imitation)
         if cfg.init_from:
-            parts.bbc.load_state_dict(Artifact.load(policy_folder(cfg.init_from), kind="bbc").state)
+            parts.bbc.load_state_dict(Artifact.load(cfg.init_from, kind="bbc").state)
         elif cfg.imitation.cloning:
             error = clone_behaviour(parts.bbc, parts.demonstrations, cfg.imitation.cloning)
             print(f"cloned {len(parts.dataset.labelled_clips)} labelled clips: squared action error {error:.3f}")

@@ -136,7 +136,7 @@ def build(cfg: Config) -> Components:
         if cfg.init_from is None:
             raise ValueError("--imitation.anchor holds on to the policy of --init-from RUN; give both or neither")
         anchor = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std).requires_grad_(False)
-        anchor.load_state_dict(Artifact.load(policy_folder(cfg.init_from), kind="bbc").state)
+        anchor.load_state_dict(Artifact.load(cfg.init_from, kind="bbc").state)
     critic_keys = [keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.COMMAND, keys.PEAK]
     critic_keys += [keys.HISTORY] if ppo.critic_history else []
     width = sum(env.observation_spec[key].shape[1:].numel() for key in critic_keys)
@@ -290,8 +290,3 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
         "num_skills": len(BEHAVIOURS) if cfg.imitation.conditional else None,
     }
     Artifact.save(folder / "discriminator", parts.discriminator.state_dict(), manifest)
-
-
-def policy_folder(path: Path) -> Path:
-    """The artifact in a run folder, or the folder itself."""
-    return path / "policy" if (path / "policy").is_dir() else path

@@ -177,8 +177,7 @@ def free_file(folder: Path) -> Path:
 
 def load(cfg: Config) -> tuple[Artifact, DeployedBBC]:
     """The controller, ready to run."""
-    folder = cfg.artifact / "policy" if (cfg.artifact / "policy").is_dir() else cfg.artifact
-    artifact = Artifact.load(folder, kind="bbc")
+    artifact = Artifact.load(cfg.artifact, kind="bbc")
     network = onnx_network(artifact) if cfg.backend == "onnx" else torch_network(artifact)
     return artifact, DeployedBBC(network, artifact)
 

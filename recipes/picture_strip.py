@@ -3,7 +3,7 @@
 In:  an episode (``.mcap``) as ``perform.py`` or an EpisodeRecorder writes it.
 Out: a PNG. Needs a machine that can render: ``MUJOCO_GL=egl`` without a display.
 
-    MUJOCO_GL=egl python recipes/picture_strip.py runs/my_run/episodes/play_0.mcap strip.png
+    MUJOCO_GL=egl python recipes/picture_strip.py runs/my_run/episodes/perform_0.mcap strip.png
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ class Start:
 
 def load(folder: Path) -> DeployedBBC:
     """The controller, ready to run."""
-    artifact = Artifact.load(folder / "policy" if (folder / "policy").is_dir() else folder, kind="bbc")
+    artifact = Artifact.load(folder, kind="bbc")
     return DeployedBBC(torch_network(artifact), artifact)
 
 

@@ -92,7 +92,7 @@ def load_controller(path: Path) -> Controller:
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected the folder of a run or an artifact, found none; check the path")
     run = path.parent if path.name == "policy" else path
-    artifact = Artifact.load(path / "policy" if (path / "policy").is_dir() else path, kind="bbc")
+    artifact = Artifact.load(path, kind="bbc")
     if "network" not in artifact.manifest:
         raise ArtifactError(f"{artifact.folder}: the manifest lacks 'network'; export the policy with bbc_pretrain.py")
     bbc = BasicBehaviourController(**artifact.manifest["network"])

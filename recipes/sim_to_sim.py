@@ -201,7 +201,7 @@ def main(cfg: Config, console: Console | None = None) -> dict[float, dict[str, F
         raise ValueError(f"expected --output to end in .json, got {cfg.output}")
     wide = None if sys.stdout.isatty() else 140  # a pipe has no width: do not fold the tables to 80 columns
     console, begin = console or Console(width=wide), time.monotonic()
-    artifact = Artifact.load(cfg.run / "policy" if (cfg.run / "policy").is_dir() else cfg.run, kind="bbc")
+    artifact = Artifact.load(cfg.run, kind="bbc")
     friction = artifact.manifest.get("simulation", {}).get("friction_loss", 0.0)
     friction = friction if cfg.friction_loss is None else cfg.friction_loss
     skill = torch.tensor([skill_index(name) for name in cfg.behaviours]).repeat_interleave(cfg.episodes)

@@ -74,7 +74,7 @@ def load_trained(path: Path, kind: str | None = None, allowed: Sequence[str] | N
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected the folder of a run or an artifact, found none; check the path")
     run = path.parent if path.name == "policy" else path
-    artifact = Artifact.load(path / "policy" if (path / "policy").is_dir() else path)
+    artifact = Artifact.load(path)
     manifest = artifact.manifest
     expected = NETWORKS if kind is None else (kind,)
     if manifest["kind"] not in expected or "network" not in manifest:

@@ -112,8 +112,7 @@ def train(cfg: Config) -> Path:
 
     def begin() -> None:
         if cfg.init_from is not None:
-            source = cfg.init_from / "policy" if (cfg.init_from / "policy").is_dir() else cfg.init_from
-            parts.teacher.load_state_dict(Artifact.load(source, kind="teacher").state)
+            parts.teacher.load_state_dict(Artifact.load(cfg.init_from, kind="teacher").state)
 
     folder = run(
         "tsc_teacher",

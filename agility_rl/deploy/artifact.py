@@ -25,6 +25,8 @@ from torch import Tensor
 import agility_rl
 from agility_rl.go2 import constants, features
 
+POLICY_FOLDER = "policy"
+"""Where a run keeps its artifact."""
 MANIFEST_FILE = "manifest.json"
 FORMAT = "agility_rl.artifact"
 FORMAT_VERSION = 2
@@ -117,7 +119,7 @@ class Artifact:
         """Read an artifact and check it: format, completeness, joint order, checksums, and every tensor's shape.
 
         Args:
-            folder: as given to :meth:`save`.
+            folder: as given to :meth:`save`, or the run whose ``policy/`` it is.
             kind: refuse an artifact of another kind, such as a teacher where a BBC is expected.
 
         Raises:
@@ -125,10 +127,12 @@ class Artifact:
             ArtifactError: if anything disagrees; the message says what was expected, what was found, and what to do.
         """
         folder = Path(folder)
+        if not (folder / MANIFEST_FILE).is_file() and (folder / POLICY_FOLDER / MANIFEST_FILE).is_file():
+            folder = folder / POLICY_FOLDER
         path = folder / MANIFEST_FILE
         if not path.is_file():
             raise FileNotFoundError(
-                f"no artifact in {folder}: {MANIFEST_FILE} is missing; give the policy/ folder of a run"
+                f"no artifact in {folder}: {MANIFEST_FILE} is missing; give the {POLICY_FOLDER}/ folder of a run, or the run"
             )
         try:
             manifest = json.loads(path.read_text(encoding="utf-8"))

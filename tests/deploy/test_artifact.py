@@ -195,6 +195,12 @@ def test_damaged_weights_are_refused(tmp_path: Path, manifest: dict[str, Any]) -
         Artifact.load(tmp_path)
 
 
+def test_a_run_is_as_good_as_its_policy(tmp_path: Path, manifest: dict[str, Any]) -> None:
+    saved = Artifact.save(tmp_path / "policy", state(), manifest)
+    found = Artifact.load(tmp_path, kind=manifest["kind"])
+    assert found.folder == saved.folder == tmp_path / "policy" and found.manifest == saved.manifest
+
+
 def test_other_errors(tmp_path: Path, manifest: dict[str, Any]) -> None:
     with pytest.raises(FileNotFoundError, match=r"give the policy/ folder of a run"):
         Artifact.load(tmp_path)
