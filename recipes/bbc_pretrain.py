@@ -26,7 +26,7 @@ from bbc_setup import ANCHORED, Components, build, save_policy
 from held_fixed import infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import Laps, run
+from training_run import Laps, own_options, run
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
@@ -177,33 +177,29 @@ def update_adaptation(parts: Components, minibatches: int, batch: TensorDictBase
     return {name: value.detach() for name, value in totals.items() if value.numel() == 1}
 
 
+def begin(parts: Components, cfg: Config) -> None:
+    """Where a new run starts from: labels for Q^c, and another run's policy or the labelled clips."""
+    warm_up_predictor(parts, cfg.imitation)
+    if cfg.init_from:
+        parts.bbc.load_state_dict(Artifact.load(cfg.init_from, kind="bbc").state)
+    elif cfg.imitation.cloning:
+        error = clone_behaviour(parts.bbc, parts.demonstrations, cfg.imitation.cloning)
+        print(f"cloned {len(parts.dataset.labelled_clips)} labelled clips: squared action error {error:.3f}")
+
+
 def train(cfg: Config) -> Path:
-    """Algorithm S1."""
-    if cfg.resume is not None:  # a run goes on with its own options; only how long may change
-        own = cli.read_config(cfg.resume, Config)
-        cfg = replace(own, resume=cfg.resume, iterations=cfg.iterations, max_minutes=cfg.max_minutes)
+    """Algorithm S1; returns the run folder."""
+    cfg = own_options(cfg)
     check_changes(cfg)
-    parts = build(cfg)
-
-    def begin() -> None:
-        warm_up_predictor(parts, cfg.imitation)
-        if cfg.init_from:
-            parts.bbc.load_state_dict(Artifact.load(cfg.init_from, kind="bbc").state)
-        elif cfg.imitation.cloning:
-            error = clone_behaviour(parts.bbc, parts.demonstrations, cfg.imitation.cloning)
-            print(f"cloned {len(parts.dataset.labelled_clips)} labelled clips: squared action error {error:.3f}")
-
-    folder = run(
+    return run(
         "bbc_pretrain",
         cfg,
-        checkpoint=parts.checkpoint,
+        build(cfg),
         begin=begin,
-        iterate=lambda iteration: iterate(parts, cfg, iteration),
-        save_policy=lambda folder: save_policy(parts, cfg, folder),
+        iterate=iterate,
+        save_policy=save_policy,
         headline=HEADLINE,
     )
-    parts.env.close()
-    return folder
 
 
 def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:

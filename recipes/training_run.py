@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
+
+from torchrl.envs import EnvBase
 
 from agility_rl.record import MCAPLogger
 from agility_rl.training import cli
@@ -14,7 +17,7 @@ from agility_rl.training.display import Display
 
 
 class RunConfig(Protocol):
-    """Options that every such recipe has."""
+    """Options that every training has."""
 
     @property
     def name(self) -> str: ...
@@ -28,6 +31,29 @@ class RunConfig(Protocol):
     def checkpoint_every(self) -> int: ...
     @property
     def resume(self) -> Path | None: ...
+
+
+class Parts(Protocol):
+    """What a training is made of."""
+
+    @property
+    def env(self) -> EnvBase: ...
+
+    def checkpoint(self, folder: Path, progress: dict[str, float]) -> RunCheckpoint:
+        """All that a bit-exact continuation needs."""
+        ...
+
+
+C = TypeVar("C", bound=RunConfig)
+P = TypeVar("P", bound=Parts)
+
+
+def own_options(cfg: C) -> C:
+    """Those with which a run that is resumed began; only how long it goes on may change."""
+    if cfg.resume is None:
+        return cfg
+    kept = {"resume": cfg.resume, "iterations": cfg.iterations, "max_minutes": cfg.max_minutes}
+    return replace(cli.read_config(cfg.resume, type(cfg)), **kept)  # type: ignore[type-var]
 
 
 class Laps:
@@ -49,20 +75,20 @@ class Laps:
 
 def run(
     recipe: str,
-    cfg: RunConfig,
+    cfg: C,
+    parts: P,
     *,
-    checkpoint: Callable[[Path, dict[str, float]], RunCheckpoint],
-    begin: Callable[[], None],
-    iterate: Callable[[int], dict[str, float]],
-    save_policy: Callable[[Path], None],
+    begin: Callable[[P, C], None],
+    iterate: Callable[[P, C, int], dict[str, float]],
+    save_policy: Callable[[P, C, Path], None],
     headline: tuple[str, ...],
 ) -> Path:
-    """Train until the iterations, the time or the user end it, and save everything.
+    """Train until the iterations, the time or the user end it, save everything, and close the environment.
 
     Args:
         recipe: its name.
         cfg: its options.
-        checkpoint: from a folder and the progress to the checkpoint of all parts.
+        parts: what it is made of.
         begin: called once in a new run, before the first iteration.
         iterate: from the number of finished iterations to the metrics of the next.
         save_policy: writes the artifact into a run folder.
@@ -74,21 +100,21 @@ def run(
     resumed = cfg.resume is not None
     folder = cli.start_run(cfg, cfg.resume or cfg.runs / cfg.name, resume=resumed, recipe=recipe)
     progress: dict[str, float] = {"iteration": 0, "minutes": 0.0}
-    saved = checkpoint(folder / "checkpoints", progress)
+    saved = parts.checkpoint(folder / "checkpoints", progress)
     if resumed:
         saved.load()
     else:
-        begin()
+        begin(parts, cfg)
     logger = MCAPLogger(folder.name, folder.parent, resume=resumed)
     start = time.monotonic() - 60.0 * progress["minutes"]
 
     def save() -> None:
         saved.save(int(progress["iteration"]))
-        save_policy(folder)
+        save_policy(parts, cfg, folder)
 
     with Display(recipe, cfg.iterations, headline=headline) as display, cli.interruptible() as interrupted:
         while progress["iteration"] < cfg.iterations and not interrupted():
-            metrics = iterate(int(progress["iteration"]))
+            metrics = iterate(parts, cfg, int(progress["iteration"]))
             progress["iteration"] += 1
             progress["minutes"] = metrics["time/minutes"] = (time.monotonic() - start) / 60.0
             logger.log_metrics(metrics, step=int(progress["iteration"]))
@@ -99,5 +125,6 @@ def run(
                 break
     save()
     logger.close()
+    parts.env.close()
     print(f"saved {folder}")
     return folder

@@ -17,7 +17,6 @@ Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper``. Ctrl-C ends the it
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -25,7 +24,7 @@ from course_metrics import judge, set_course
 from encoder_pretraining import pretrain
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import Laps, run
+from training_run import Laps, own_options, run
 from tsc_student_config import PRESETS, Config
 from tsc_student_setup import (
     Components,
@@ -134,30 +133,26 @@ def check(cfg: Config) -> None:
         )
 
 
+def begin(parts: Components, cfg: Config) -> None:
+    """Start from another run's student, if one is given."""
+    if cfg.init_from is not None:
+        load_student(parts, cfg.init_from)
+
+
 def train(cfg: Config) -> Path:
     """Algorithm S3, the student; returns the run folder."""
-    if cfg.resume is not None:  # a run goes on with its own options; only how long may change
-        own = cli.read_config(cfg.resume, Config)
-        cfg = replace(own, resume=cfg.resume, iterations=cfg.iterations, max_minutes=cfg.max_minutes)
+    cfg = own_options(cfg)
     check(cfg)
     cfg, trained = resolve(cfg)
-    parts = build(cfg, trained)
-
-    def begin() -> None:
-        if cfg.init_from is not None:
-            load_student(parts, cfg.init_from)
-
-    folder = run(
+    return run(
         "tsc_student",
         cfg,
-        checkpoint=parts.checkpoint,
+        build(cfg, trained),
         begin=begin,
-        iterate=lambda iteration: iterate(parts, cfg, iteration),
-        save_policy=lambda folder: save_policy(parts, cfg, folder),
+        iterate=iterate,
+        save_policy=save_policy,
         headline=HEADLINE,
     )
-    parts.env.close()
-    return folder
 
 
 if __name__ == "__main__":

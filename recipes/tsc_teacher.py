@@ -14,7 +14,6 @@ Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper``.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from course_metrics import judge, set_course
 from held_fixed import infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import Laps, run
+from training_run import Laps, own_options, run
 from tsc_config import PRESETS, Config
 from tsc_setup import Components, build, save_policy
 
@@ -101,30 +100,26 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     return {name: float(value) for name, value in metrics.items()} | lap.metrics
 
 
+def begin(parts: Components, cfg: Config) -> None:
+    """Start from another run's teacher, if one is given."""
+    if cfg.init_from is not None:
+        parts.teacher.load_state_dict(Artifact.load(cfg.init_from, kind="teacher").state)
+
+
 def train(cfg: Config) -> Path:
     """Algorithm S3, the teacher; returns the run folder."""
-    if cfg.resume is not None:  # a run goes on with its own options; only how long may change
-        own = cli.read_config(cfg.resume, Config)
-        cfg = replace(own, resume=cfg.resume, iterations=cfg.iterations, max_minutes=cfg.max_minutes)
+    cfg = own_options(cfg)
     if unknown := sorted(set(cfg.behaviours) - set(BEHAVIOURS)):
         raise ValueError(f"--behaviours: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
-    parts = build(cfg)
-
-    def begin() -> None:
-        if cfg.init_from is not None:
-            parts.teacher.load_state_dict(Artifact.load(cfg.init_from, kind="teacher").state)
-
-    folder = run(
+    return run(
         "tsc_teacher",
         cfg,
-        checkpoint=parts.checkpoint,
+        build(cfg),
         begin=begin,
-        iterate=lambda iteration: iterate(parts, cfg, iteration),
-        save_policy=lambda folder: save_policy(parts, cfg, folder),
+        iterate=iterate,
+        save_policy=save_policy,
         headline=HEADLINE,
     )
-    parts.env.close()
-    return folder
 
 
 if __name__ == "__main__":

@@ -132,7 +132,8 @@ class Artifact:
         path = folder / MANIFEST_FILE
         if not path.is_file():
             raise FileNotFoundError(
-                f"no artifact in {folder}: {MANIFEST_FILE} is missing; give the {POLICY_FOLDER}/ folder of a run, or the run"
+                f"no artifact in {folder}: {MANIFEST_FILE} is missing; give the {POLICY_FOLDER}/ folder of a run, "
+                "or the run itself"
             )
         try:
             manifest = json.loads(path.read_text(encoding="utf-8"))
