@@ -205,11 +205,8 @@ def print_attention(result: Mapping[str, Any], disturbances: Mapping[str, str], 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     config = tyro.cli(Config, args=arguments, description=__doc__)
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=160)
     with cli.one_line_errors():
-        attend(config, console)
+        attend(config, cli.console(160))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ class MotionConfig:
     """Add the left-right mirrored motion."""
     one_sided: tuple[str, ...] = ()
     """Behaviours whose labelled clips are not mirrored."""
+    turns: tuple[float, ...] = ()
+    """Labelled clips are also bent to both sides, at these shares of the largest turn rate that is commanded."""
     offsets: tuple[int, ...] = (0, 1)
     """Frames that the discriminator sees together, in control steps from the oldest (Table S1: two consecutive)."""
     standing_weight: float = 0.1
@@ -124,6 +126,8 @@ class ImitationConfig:
     anchor: float = 0.0
     """Weight of staying near the policy of ``--init-from`` (squared distance of the mean actions): PPO then mends falls
     and leaves good gaits alone, which a discriminator that starts anew would not."""
+    anchor_turn_rate: float | None = None
+    """Commanded turn rate [rad/s] beyond which the anchor lets go: a start that goes straight is no example there."""
     warm_up: int = 0
     """Steps in which the predictor learns the labels before anything else, so that its first rewards mean something."""
     information: float = 1.0

@@ -15,13 +15,14 @@ Out: ``runs/NAME/`` with ``config.json`` and ``policy/``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import torch
 from rollouts import Controller, MotionConfig, load_controller, load_motion
+from steering import steered
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import mse_loss
@@ -53,6 +54,8 @@ class Config:
     teachers: tuple[tuple[str, Path], ...] = ()
     """Behaviour and run or artifact folder, for each of the five behaviours. The first one's network is the student's,
     and its weights are where the student starts."""
+    steered: tuple[str, ...] = ()
+    """Behaviours whose teacher only goes straight ahead: it is led along the commanded curves (``steering.py``)."""
     num_robots: int = 512
     rounds: int = 24
     teacher_rounds: int = 2
@@ -83,8 +86,10 @@ def load_teachers(cfg: Config) -> list[Controller]:
     """The teacher of every behaviour, in the order of the behaviours.
 
     Raises:
-        ValueError: if a behaviour is missing, named twice, or none of the five.
+        ValueError: if a behaviour is missing, named twice, or none of the five, here or in ``--steered``.
     """
+    if unknown := sorted(set(cfg.steered) - set(BEHAVIOURS)):
+        raise ValueError(f"--steered: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
     names = [name for name, _ in cfg.teachers]
     if sorted(names) != sorted(BEHAVIOURS):
         raise ValueError(
@@ -97,14 +102,18 @@ def load_teachers(cfg: Config) -> list[Controller]:
     return [loaded[dict(cfg.teachers)[name]] for name in BEHAVIOURS]
 
 
-def labeller(teachers: list[Controller]) -> Act:
-    """A function that gives the mean action ``[B, 12]`` of the teacher of each row's behaviour."""
-    controllers = {id(teacher.bbc): teacher.bbc for teacher in teachers}
-    index = torch.tensor([list(controllers).index(id(teacher.bbc)) for teacher in teachers])
+def labeller(teachers: list[Controller], lead: Collection[str]) -> Act:
+    """A function that gives the mean action ``[B, 12]`` of the teacher of each row's behaviour, some of them led."""
+    kinds = [(id(teacher.bbc), name in lead) for name, teacher in zip(BEHAVIOURS, teachers, strict=True)]
+    acts = {
+        kind: steered(partial(mean_action, teacher.bbc)) if kind[1] else partial(mean_action, teacher.bbc)
+        for kind, teacher in zip(kinds, teachers, strict=True)
+    }
+    index = torch.tensor([list(acts).index(kind) for kind in kinds])
 
     @torch.no_grad()
     def label(observation: TensorDictBase) -> Tensor:
-        said = torch.stack([mean_action(bbc, observation) for bbc in controllers.values()])
+        said = torch.stack([act(observation) for act in acts.values()])
         return said[index[observation[keys.SKILL]], torch.arange(len(observation))]
 
     return label
@@ -169,7 +178,7 @@ def main(cfg: Config) -> Path:
         episode_length=cfg.episode_length,
         seed=seeds.integer("environment"),
     )
-    label, carrier = labeller(teachers), env.reset()
+    label, carrier = labeller(teachers, cfg.steered), env.reset()
     optimizer = torch.optim.Adam(bbc.parameters(), lr=cfg.learning_rate)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, cfg.rounds)
     replay = TensorDictReplayBuffer(

@@ -15,7 +15,6 @@ Presets: ``smoke`` (seconds), ``cpu`` (about ten minutes on two cores), ``paper`
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -152,8 +151,7 @@ def table(title: str, found: dict[str, Any]) -> Table:
 
 def main(cfg: Config, console: Console | None = None) -> Path:
     """Fine-tune, then compare; returns the run folder."""
-    wide = None if sys.stdout.isatty() else 120  # a file has no width: do not fold the tables to 80 columns
-    console = console or Console(soft_wrap=True, highlight=False, width=wide)
+    console = console or cli.console(120)
     if cfg.resume is not None:
         own = cli.read_config(cfg.resume, bbc_config.Config)
         cfg = replace(cfg, init_from=own.init_from, simulator=own.env.simulator, motion=own.motion)

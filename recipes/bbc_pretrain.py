@@ -29,7 +29,7 @@ from torch import Tensor
 from training_run import Laps, own_options, run
 
 from agility_rl import keys
-from agility_rl.behaviours import BEHAVIOURS
+from agility_rl.behaviours import BEHAVIOURS, COMMANDS
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.losses import functional
 from agility_rl.training import cli
@@ -157,10 +157,14 @@ def hold(parts: Components, batch: TensorDictBase) -> None:
     batch[ANCHORED] = flat["loc"].unflatten(0, batch.batch_size)
 
 
-def distance_to_anchor(parts: Components, sample: TensorDictBase) -> Tensor:
-    """Mean squared difference between the mean actions of policy and anchor [action units squared]."""
+def distance_to_anchor(parts: Components, sample: TensorDictBase, turn_rate: float | None) -> Tensor:
+    """Mean squared difference between the mean actions of policy and anchor [action units squared]; zero where a faster
+    turn than ``turn_rate`` [rad/s] is commanded."""
     policy = parts.bbc.trained_actor()[:-1]
-    return torch.nn.functional.mse_loss(policy(sample.select(*policy.in_keys))["loc"], sample[ANCHORED])
+    error = (policy(sample.select(*policy.in_keys))["loc"] - sample[ANCHORED]).square().mean(-1)
+    if turn_rate is not None:
+        error = error * (sample[keys.COMMAND][:, COMMANDS.index("yaw_rate")].abs() <= turn_rate)
+    return error.mean()
 
 
 def update_adaptation(parts: Components, minibatches: int, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -247,7 +251,10 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
             loss = parts.privileged_loss(sample)["loss_privileged"] if weight > 0.0 else torch.zeros(())
             if kept > 0.0:
                 loss = loss + kept * parts.demonstrations.error(parts.bbc)
-            return loss if parts.anchor is None else loss + cfg.imitation.anchor * distance_to_anchor(parts, sample)
+            if parts.anchor is not None:
+                away = distance_to_anchor(parts, sample, cfg.imitation.anchor_turn_rate)
+                loss = loss + cfg.imitation.anchor * away
+            return loss
 
         metrics |= parts.ppo(batch, parts.generator, extra, critic_only=iteration < cfg.ppo.critic_warm_up)
     lap("policy")

@@ -272,6 +272,7 @@ def load_motion(cfg: MotionConfig, seed: int) -> MotionDataset:
         mirror=cfg.mirror,
         standing_weight=cfg.standing_weight,
         one_sided=cfg.one_sided,
+        turns=cfg.turns,
     )
 
 

@@ -222,11 +222,8 @@ def compare(config: Config, console: Console) -> dict[str, Any]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     config = tyro.cli(Config, args=arguments, description=__doc__)
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=160)
     with cli.one_line_errors():
-        compare(config, console)
+        compare(config, cli.console(160))
 
 
 if __name__ == "__main__":

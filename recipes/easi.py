@@ -17,7 +17,6 @@ Presets: ``smoke`` (seconds), ``cpu`` (two cores, ours), ``paper`` (Table S3).
 from __future__ import annotations
 
 import json
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -241,8 +240,7 @@ def evolve(parts: Components, cfg: Config) -> dict[str, float]:
 
 def train(cfg: Config, console: Console | None = None) -> Path:
     """Algorithm S2; returns the run folder."""
-    wide = None if sys.stdout.isatty() else 120  # a file has no width, and a table folded to 80 columns is hard to read
-    console = console or Console(soft_wrap=True, highlight=False, width=wide)
+    console = console or cli.console(120)
     if cfg.resume is not None:  # a run goes on with its own options; only how long and how fast may change
         own = cli.read_config(cfg.resume, Config)
         changed = {name: getattr(cfg, name) for name in ("resume", "generations", "max_minutes", "num_threads")}

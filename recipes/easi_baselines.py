@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -197,7 +196,7 @@ def compare_on(cfg: Config, folder: Path, index: int, name: str, console: Consol
 
 def main(cfg: Config, console: Console | None = None) -> Path:
     """Compare on all targets, print and write the table; returns the run folder."""
-    console = console or Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 160)
+    console = console or cli.console(160)
     if cfg.resume is not None:
         own = cli.read_config(cfg.resume, Config)
         changed = {name: getattr(cfg, name) for name in ("resume", "targets", "conditions", "methods")}

@@ -15,7 +15,6 @@ An episode with a fall counts as not recognised. The first second is left out of
 from __future__ import annotations
 
 import math
-import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,8 +43,7 @@ from agility_rl.motion.gait_analysis import (
     measure_windows,
 )
 from agility_rl.record.plots import behaviour_matrix, save_figure
-from agility_rl.training import metrics
-from agility_rl.training.cli import versions, write_json
+from agility_rl.training import cli, metrics
 
 COLUMNS = (*GAIT_LABELS, "fall")
 FALL = COLUMNS.index("fall")
@@ -278,23 +276,17 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         "weights": controller.artifact.manifest["weights"]["sha256"],
         "motion": {"source": motion.source, "synthetic": motion.synthetic},
         "settings": config,
-        "versions": versions(),
+        "versions": cli.versions(),
         **found,
         "targets": targets(found),
         "seconds": time.monotonic() - begin,
     }
-    write_json(output / "evaluation.json", to_json(result))
+    cli.write_json(output / "evaluation.json", to_json(result))
     print_evaluation(result, console)
     console.print(f"{output / 'evaluation.json'} and figures written after {result['seconds']:.0f} s", highlight=False)
     return result
 
 
 if __name__ == "__main__":
-    screen = Console()
-    if not screen.is_terminal:
-        screen = Console(width=140)  # a pipe has no width: do not fold the tables to 80 columns
-    try:
-        evaluate(tyro.cli(Config, description=__doc__), screen)
-    except (ValueError, OSError) as error:
-        screen.print(f"[red]error[/] {error}", soft_wrap=True, highlight=False)
-        sys.exit(2)
+    with cli.one_line_errors():
+        evaluate(tyro.cli(Config, description=__doc__), cli.console(140))

@@ -207,11 +207,8 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     config = tyro.cli(Config, args=arguments, description=__doc__)
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=160)  # a pipe has no width: do not fold the tables to 80 columns
     with cli.one_line_errors():
-        evaluate(config, console)
+        evaluate(config, cli.console(160))
 
 
 if __name__ == "__main__":

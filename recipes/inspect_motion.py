@@ -36,6 +36,7 @@ from agility_rl.motion.gait_analysis import (
 )
 from agility_rl.motion.gaits import synthesize_gait
 from agility_rl.record.plots import footfall_diagram, save_figure
+from agility_rl.training import cli
 
 SUFFIXES = (".json", ".txt", ".csv", ".pkl", ".npz", ".bvh")
 NOT_MOTION = re.compile(r"licen[cs]e|readme|_info(\.|$)|_pose\.txt$|sha256", re.IGNORECASE)
@@ -228,11 +229,5 @@ def main(config: Config, console: Console) -> int:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)  # clips are small; threads would only wait for each other
-    screen = Console()
-    if not screen.is_terminal:
-        screen = Console(width=220)  # a pipe has no width: do not fold the table to 80 columns
-    try:
-        sys.exit(main(tyro.cli(Config, description=__doc__), screen))
-    except (MotionError, OSError) as error:
-        screen.print(f"[red]error[/] {error}", soft_wrap=True, highlight=False)
-        sys.exit(2)
+    with cli.one_line_errors():
+        sys.exit(main(tyro.cli(Config, description=__doc__), cli.console(220)))

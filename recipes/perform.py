@@ -36,6 +36,7 @@ from agility_rl.go2 import features
 from agility_rl.record import EpisodeRecorder, read_episode
 from agility_rl.record.episode import read_metadata
 from agility_rl.record.layout import write_layout
+from agility_rl.training import cli
 
 MEASURED = ("velocity_x", "velocity_y", "yaw_rate", "height")
 
@@ -187,9 +188,5 @@ def main(config: Config, console: Console) -> Path:
 
 
 if __name__ == "__main__":
-    screen = Console(soft_wrap=True, highlight=False)
-    try:
-        main(tyro.cli(Config, description=__doc__), screen)
-    except (ValueError, OSError) as error:
-        screen.print(f"[red]error[/] {error}")
-        sys.exit(2)
+    with cli.one_line_errors():
+        main(tyro.cli(Config, description=__doc__), cli.console(80))

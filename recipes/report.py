@@ -11,7 +11,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -23,13 +22,12 @@ import tyro
 from judgement import show
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from rich.console import Console
 
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.record import read_scalars
 from agility_rl.record.plots import Curves, learning_curves
+from agility_rl.training import cli
 from agility_rl.training.checkpoint import publish
-from agility_rl.training.cli import CONFIG_FILE
 
 STYLE = """
 :root { --ink: #1d2530; --faint: #6b7685; --line: #dde2e8; --good: #1a7f4b; --bad: #b3261e; --card: #f6f8fa; }
@@ -219,10 +217,12 @@ def page(run: Path) -> str:
     Raises:
         FileNotFoundError: if the folder is no run.
     """
-    record, found = read_json(run / CONFIG_FILE), read_json(run / "evaluation.json")
+    record, found = read_json(run / cli.CONFIG_FILE), read_json(run / "evaluation.json")
     manifest = read_json(run / "policy" / "manifest.json") or {}
     if record is None and found is None:
-        raise FileNotFoundError(f"{run}: expected a run folder with {CONFIG_FILE} or evaluation.json; check the path")
+        raise FileNotFoundError(
+            f"{run}: expected a run folder with {cli.CONFIG_FILE} or evaluation.json; check the path"
+        )
     record = record or {}
     parts = [f"<h1>{escape(run.resolve().name)}</h1>"]
     origin = [record.get("recipe"), record.get("started"), " ".join(record.get("command", []))]
@@ -256,9 +256,5 @@ def main(config: Config) -> Path:
 
 
 if __name__ == "__main__":
-    screen = Console()
-    try:
-        screen.print(main(tyro.cli(Config, description=__doc__)).as_posix(), soft_wrap=True, highlight=False)
-    except (ValueError, OSError) as error:
-        screen.print(f"[red]error[/] {error}", soft_wrap=True, highlight=False)
-        sys.exit(2)
+    with cli.one_line_errors():
+        print(main(tyro.cli(Config, description=__doc__)).as_posix())

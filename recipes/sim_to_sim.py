@@ -17,7 +17,6 @@ standing. The first second is left out of everything but falls and limits.
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -199,8 +198,7 @@ def main(cfg: Config, console: Console | None = None) -> dict[float, dict[str, F
         )
     if cfg.output is not None and cfg.output.suffix != ".json":
         raise ValueError(f"expected --output to end in .json, got {cfg.output}")
-    wide = None if sys.stdout.isatty() else 140  # a pipe has no width: do not fold the tables to 80 columns
-    console, begin = console or Console(width=wide), time.monotonic()
+    console, begin = console or cli.console(140), time.monotonic()
     artifact = Artifact.load(cfg.run, kind="bbc")
     friction = artifact.manifest.get("simulation", {}).get("friction_loss", 0.0)
     friction = friction if cfg.friction_loss is None else cfg.friction_loss

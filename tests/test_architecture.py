@@ -13,12 +13,13 @@ import pytest
 REPOSITORY = Path(__file__).parents[1]
 PACKAGE = REPOSITORY / "agility_rl"
 
-GROUND = {"keys", "behaviours", "rotations"}
+GROUND = {"keys", "behaviours", "rotations", "bending"}
 MAY_IMPORT: dict[str, set[str]] = {
     "": set(),
     "keys": set(),
     "behaviours": set(),
     "rotations": set(),
+    "bending": set(),
     "go2": GROUND,
     "simulation": GROUND | {"go2"},
     "motion": GROUND | {"go2"},

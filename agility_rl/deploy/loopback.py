@@ -132,10 +132,10 @@ class LoopbackTransport:
 
     Example:
         >>> import threading
-        >>> from agility_rl.deploy.robot_process import RobotServer
+        >>> from agility_rl.deploy.robot_process import RobotServer, in_real_time
         >>> from agility_rl.deploy.simulated import SimulatedRobot
         >>> server = RobotServer(SimulatedRobot())
-        >>> thread = threading.Thread(target=server.serve, kwargs={"seconds": 0.2})
+        >>> thread = threading.Thread(target=in_real_time, args=(server, 0.2))
         >>> thread.start()
         >>> transport = LoopbackTransport(server.port)
         >>> transport.joint_names[0], transport.read().joint_position.shape

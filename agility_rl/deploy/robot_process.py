@@ -82,7 +82,9 @@ def in_real_time(served: Served, seconds: float | None = None, stopped: Callable
 
 
 class RobotServer:
-    """Steps a simulated robot in real time, obeys the commands that arrive, and tells its state to who asked.
+    """A simulated robot's end of the loopback line: obeys the commands that arrive, tells its state to who asked.
+
+    :func:`in_real_time` runs it.
 
     Source: supplement S3 (motors at 1,000 Hz).
 
@@ -93,7 +95,6 @@ class RobotServer:
     Attributes:
         port: the port.
         rejected: packets that were damaged or unknown.
-        lost: simulated seconds that could not be made up for.
     """
 
     def __init__(self, robot: SimulatedRobot, port: int = 0) -> None:
@@ -103,12 +104,8 @@ class RobotServer:
         self._socket.setblocking(False)
         self.port: int = self._socket.getsockname()[1]
         self.commanders = Commanders()
-        self.rejected, self.lost = 0, 0.0
+        self.rejected = 0
         self._listeners: dict[tuple[str, int], float] = {}
-
-    def serve(self, seconds: float | None = None, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Run in real time until told to stop, or for some time."""
-        self.lost += in_real_time(self, seconds, stopped)
 
     def receive(self) -> None:
         """Take everything that has arrived; the newest command counts, whoever sent it."""

@@ -14,17 +14,20 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from agility_rl import keys
-from agility_rl.behaviours import BEHAVIOURS, NUM_BEHAVIOURS
+from agility_rl.behaviours import BEHAVIOURS, COMMAND_RANGES, NUM_BEHAVIOURS
 from agility_rl.go2 import features as go2_features
 from agility_rl.motion.clip import CONTROL_DT, MotionClip, MotionError
+from agility_rl.motion.edit import bend, curvature_limits, resample
 from agility_rl.motion.edit import mirror as mirror_clip
-from agility_rl.motion.edit import resample
 
 FrameFeatures = Callable[[MotionClip], Tensor]
 """Maps a clip of ``T`` frames to ``[T, F]`` features."""
 
 STANDING_SPEED = 0.1
 """Slower dogs stand [m/s]."""
+
+TIGHTEST = 2.0
+"""Largest curvature to which a clip is bent [1/m]: half a metre is a little more than the robot's length."""
 
 _STATE = (
     "root_quaternion",
@@ -73,12 +76,15 @@ class MotionDataset:
         mirror: also draw from the mirror image of every clip, each with half its weight.
         one_sided: labels whose labelled clips are not mirrored: a canter has a leading leg, and who is shown it on
             both sides may end between them, in a bound.
+        turns: also draw from every labelled clip bent to either side, at these shares of the largest turn rate that
+            may be commanded of its behaviour (as far as its path and :data:`TIGHTEST` allow), each variant with an
+            equal part of its weight: labelled clips that lead straight ahead teach that turning is no dog's.
         features: maps a clip to the features of its frames.
         standing_weight: factor on the weight of unlabelled frames in which the dog stands, which a dog does a third of
             the time: mean speed of the second around them below 0.1 m/s.
 
     Attributes:
-        labelled_clips: the labelled clips as they are drawn from: resampled, sorted by skill, mirror images included.
+        labelled_clips: the labelled clips as they are drawn from: resampled, sorted by skill, with images and bends.
         as_recorded: whether every unlabelled start is as likely as any other, so that samples show the shares of
             behaviours in the recordings.
 
@@ -105,6 +111,7 @@ class MotionDataset:
         features: FrameFeatures = discriminator_frames,
         standing_weight: float = 1.0,
         one_sided: Collection[str] = (),
+        turns: Collection[float] = (),
     ) -> None:
         if not unlabelled:
             raise MotionError(
@@ -125,6 +132,7 @@ class MotionDataset:
             name: sum(clip.num_frames * dt for clip in labelled if clip.label == name) for name in BEHAVIOURS
         }
         self._unlabelled_seconds = sum(clip.num_frames * dt for clip in unlabelled)
+        labelled = [variant for clip in labelled for variant in _with_turns(clip, turns)]
         if mirror:
             labelled, unlabelled = _with_mirror_images(labelled, one_sided), _with_mirror_images(unlabelled)
         self.labelled_clips = tuple(labelled)
@@ -218,7 +226,7 @@ class MotionDataset:
         return frames.mean(0), frames.std(0).clamp(min=1e-3)
 
     def class_seconds(self) -> dict[str, float]:
-        """Seconds of labelled motion of every behaviour, mirror images not counted."""
+        """Seconds of labelled motion of every behaviour, mirror images and bent ones not counted."""
         return dict(self._class_seconds)
 
     def unlabelled_seconds(self) -> float:
@@ -304,3 +312,14 @@ def _with_mirror_images(clips: Sequence[MotionClip], but: Collection[str] = ()) 
             half = replace(clip, weight=clip.weight / 2)
             images += [half, mirror_clip(half)]
     return images
+
+
+def _with_turns(clip: MotionClip, shares: Collection[float]) -> list[MotionClip]:
+    """A labelled clip, and bent to either side at shares of its behaviour's largest commanded turn rate."""
+    speed = float(clip.root_linear_velocity[:, :2].norm(dim=-1).mean())
+    largest = COMMAND_RANGES[str(clip.label)].yaw_rate[1]
+    low, high = curvature_limits(clip)
+    low, high = max(low, -TIGHTEST), min(high, TIGHTEST)
+    wanted = [sign * share * largest / max(speed, 1e-6) for share in shares for sign in (-1.0, 1.0)]
+    part = replace(clip, weight=clip.weight / (1 + len(wanted)))
+    return [part, *(bend(part, min(max(curvature, low), high)) for curvature in wanted)]

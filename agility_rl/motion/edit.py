@@ -1,4 +1,4 @@
-"""Clips made from clips: another frame rate, the mirror image, feet put on the floor; and how far feet slip.
+"""Clips made from clips: another frame rate, the mirror image, a bent path, feet on the floor; and how far feet slip.
 
 A clip and its edits describe the same motion, so every edit keeps name, label and source and adds a note.
 """
@@ -12,8 +12,16 @@ import torch
 from torch import Tensor
 
 from agility_rl import rotations
+from agility_rl.bending import bend_points
 from agility_rl.go2 import constants, kinematics
-from agility_rl.motion.clip import CONTROL_DT, MotionClip, MotionError, central_difference, contacts
+from agility_rl.motion.clip import (
+    CONTROL_DT,
+    MotionClip,
+    MotionError,
+    central_difference,
+    clip_from_joints,
+    contacts,
+)
 
 FLOOR_QUANTILE = 0.1
 """Share of the frames of a window that may lie lower than the floor found in it: glitches, not stances."""
@@ -106,6 +114,62 @@ def mirror_joints(joints: Tensor) -> Tensor:
     return (joints.unflatten(-1, (4, 3))[..., [1, 0, 3, 2], :] * torch.tensor([-1.0, 1.0, 1.0])).flatten(-2)
 
 
+def bend(clip: MotionClip, curvature: float) -> MotionClip:
+    """The same motion along a curve: the ground is bent as a whole, so that a foot that stands still goes on doing so.
+
+    Every point goes where :func:`~agility_rl.bending.bend_points` puts it, x along the clip's travel; the trunk turns
+    with the ground under it. Heights, contacts, roll and pitch stay (no leaning into the curve); the joints follow from
+    the feet by inverse kinematics. A dog's labelled clips lead straight ahead; a robot that has seen nothing else takes
+    a turn for bad style.
+
+    Source: the same idea as the mirror image, an assumption about what else the animal would have done; ours.
+
+    Args:
+        clip: any clip whose trunk travels.
+        curvature: [1/m], positive to the left; at a speed of v it turns at ``curvature * v`` rad/s.
+
+    Raises:
+        MotionError: if the curvature is outside :func:`curvature_limits`.
+
+    Example:
+        >>> from agility_rl.motion import synthesize_gait
+        >>> curve = bend(synthesize_gait("trot"), 0.5)
+        >>> speed = curve.root_linear_velocity[:, :2].norm(dim=-1).mean()
+        >>> round((curve.root_angular_velocity[:, 2].mean() / speed).item(), 2)
+        0.5
+    """
+    low, high = curvature_limits(clip)
+    if not low <= curvature <= high:
+        raise MotionError(
+            f"clip {clip.name!r}: curvature {curvature:g} /m, expected {low:.2f} to {high:.2f}: its path is too wide "
+            "to be bent further"
+        )
+    to_world, along, left = _along_and_left(clip)
+    level = bend_points(torch.stack((along, left), -1), curvature) @ to_world.T + clip.root_position[0, :2]
+    position = torch.cat((level[:, 0], clip.root_position[:, 2:]), -1)
+    feet = torch.cat((level[:, 1:], clip.foot_position[..., 2:]), -1)
+    turn, none = curvature * along[:, 0], torch.zeros_like(along[:, 0])
+    quaternion = rotations.multiply(rotations.from_euler(none, none, turn), clip.root_quaternion)
+    joints = kinematics.inverse(rotations.rotate_inverse(quaternion[:, None], feet - position[:, None]))
+    image = clip_from_joints(clip.name, clip.dt, position, quaternion, joints)
+    kept = {name: getattr(clip, name) for name in ("label", "weight", "source", "synthetic", "foot_contact")}
+    return replace(image, **kept, notes=(*clip.notes, f"bent by {curvature:+.2f} /m"))
+
+
+def curvature_limits(clip: MotionClip) -> tuple[float, float]:
+    """Curvatures [1/m] to which :func:`bend` can bend a clip: no point comes nearer to the curve's centre than halfway.
+
+    Example:
+        >>> from agility_rl.motion import synthesize_gait
+        >>> low, high = curvature_limits(synthesize_gait("trot"))
+        >>> low < -2 and high > 2
+        True
+    """
+    _, _, left = _along_and_left(clip)
+    widest = left.new_tensor(1e-6)
+    return -0.5 / float(torch.maximum(-left.min(), widest)), 0.5 / float(torch.maximum(left.max(), widest))
+
+
 def floor_height(clip: MotionClip, window: float = 1.0) -> Tensor:
     """Height of the floor under a clip as its own feet tell it, ``[T]`` [m].
 
@@ -168,6 +232,17 @@ def foot_slip(clip: MotionClip) -> FootSlip:
     per_foot = (speed * touching).sum(0) / touching.sum(0).clamp(min=1.0)
     mean = float((speed * touching).sum() / touching.sum().clamp(min=1.0))
     return FootSlip(mean, float(per_foot.max()), float(touching.mean()))
+
+
+def _along_and_left(clip: MotionClip) -> tuple[Tensor, Tensor, Tensor]:
+    """Columns of the clip's travel and of its left in the world ``[2, 2]``, and how far trunk and feet ``[T, 5]`` lie
+    along both from where the trunk starts [m]."""
+    travel = clip.root_position[-1, :2] - clip.root_position[0, :2]
+    cos, sin = torch.nn.functional.normalize(travel, dim=0).unbind()
+    to_world = torch.stack((torch.stack((cos, -sin)), torch.stack((sin, cos))))
+    points = torch.cat((clip.root_position[:, None], clip.foot_position), 1)[..., :2] - clip.root_position[0, :2]
+    along, left = (points @ to_world).unbind(-1)
+    return to_world, along, left
 
 
 def _edges(value: Tensor, count: int) -> Tensor:

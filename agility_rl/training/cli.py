@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
+from rich.console import Console
 from torchrl.checkpoint import CheckpointError
 
 import agility_rl
@@ -104,6 +105,18 @@ def one_line_errors() -> Iterator[None]:
         yield
     except (ValueError, OSError, CheckpointError) as error:
         _stop(" ".join(str(error).split()))
+
+
+def console(width: int) -> Console:
+    """Console of a recipe that prints tables: as wide as the terminal, else ``width`` columns.
+
+    A pipe or a file has no width, and tables folded to 80 columns are hard to read.
+
+    Example:
+        >>> console(160).width > 0
+        True
+    """
+    return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else width)
 
 
 @contextlib.contextmanager

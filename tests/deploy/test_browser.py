@@ -7,8 +7,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import pytest
 from websockets.exceptions import InvalidStatus
@@ -19,6 +18,7 @@ from agility_rl.deploy.controller import Mode
 from agility_rl.deploy.operator import Status
 from agility_rl.go2.appearance import dress
 from agility_rl.go2.model import build_spec
+from tests.waiting import until
 
 POSE = tuple(dress(build_spec()).compile().qpos0.tolist())
 
@@ -51,15 +51,6 @@ def other_addresses() -> list[str]:
         except OSError:
             pass
     return [address for address in found if address != "127.0.0.1"]
-
-
-def until(holds: Callable[[], Any], seconds: float = 10.0) -> bool:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if holds():
-            return True
-        time.sleep(0.01)
-    return False
 
 
 def test_it_serves_a_page_on_the_loopback_address_and_on_no_other(device: BrowserDevice) -> None:

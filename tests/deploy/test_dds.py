@@ -18,16 +18,10 @@ from agility_rl.deploy.robot_process import RobotProcess, in_real_time
 from agility_rl.deploy.simulated import SimulatedRobot
 from agility_rl.deploy.transport import JointCommand, RobotState
 from agility_rl.go2 import constants
+from tests.waiting import until
 
 DOMAIN = 1 + os.getpid() % 100  # tests that run at the same time must not command each other's robots
 """Not that of a robot, which is 0."""
-
-
-def until(condition, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -65,11 +59,11 @@ def test_states_come_and_commands_arrive(robot: DDSRobot) -> None:
     transport = DDSTransport(domain=DOMAIN, patience=60.0)
     assert tuple(transport.joint_names) == constants.JOINT_NAMES
     first = transport.read()
-    until(lambda: transport.read().sequence > first.sequence)
+    assert until(lambda: transport.read().sequence > first.sequence)
     assert first.time < transport.read().time <= time.monotonic() and transport.other_commanders() == ()
     gains = torch.full((12,), 31.0), torch.full((12,), 2.0)
     transport.send(JointCommand(torch.arange(12.0), *gains))
-    until(lambda: robot.robot.model.actuator_gainprm[0, 0] == 31.0)
+    assert until(lambda: robot.robot.model.actuator_gainprm[0, 0] == 31.0)
     assert robot.robot.model.actuator_biasprm[0, 2] == -2.0
     assert robot.robot.data.ctrl.tolist() == list(range(12)), "our joints, in our order"
     assert transport.other_commanders() == () and robot.rejected == 0
@@ -81,7 +75,7 @@ def test_a_command_with_a_wrong_checksum_is_ignored(robot: DDSRobot) -> None:
     transport = DDSTransport(domain=DOMAIN, patience=60.0)
     record = unitree.to_low_command(JointCommand(torch.zeros(12), torch.full((12,), 99.0), torch.ones(12)))
     record["crc"] ^= 1
-    until(lambda: transport._line.writer.write(to_message(record)) or robot.rejected > 0)
+    assert until(lambda: transport._line.writer.write(to_message(record)) or robot.rejected > 0)
     assert not (robot.robot.model.actuator_gainprm[:, 0] == 99.0).any()
     transport.close()
 
@@ -94,10 +88,10 @@ def test_a_second_commander_and_the_remote_are_seen(robot: DDSRobot, monkeypatch
         two.send(JointCommand.damped(3.0))
         return bool(one.other_commanders()) and bool(two.other_commanders())
 
-    until(both_seen)
+    assert until(both_seen)
     assert one.other_commanders() == ("1 other program",)
     two.close()
-    until(lambda: not one.other_commanders())
+    assert until(lambda: not one.other_commanders())
 
     to_low_state = unitree.to_low_state
 
@@ -107,7 +101,7 @@ def test_a_second_commander_and_the_remote_are_seen(robot: DDSRobot, monkeypatch
         return record
 
     monkeypatch.setattr(unitree, "to_low_state", pressed)  # the simulated robot has no remote control of its own
-    until(lambda: one.read() is not None and one.other_commanders() == ("the remote control (L2 + B)",))
+    assert until(lambda: one.read() is not None and one.other_commanders() == ("the remote control (L2 + B)",))
     one.close()
 
 
@@ -115,7 +109,7 @@ def test_two_processes_and_a_robot_that_falls_silent(dds: None) -> None:
     with RobotProcess(pose="standing", friction_loss=0.0, dds={"domain": DOMAIN}) as robot:
         transport = DDSTransport(domain=DOMAIN, patience=60.0)
         first = transport.read()
-        until(lambda: transport.read().sequence > first.sequence + 50)
+        assert until(lambda: transport.read().sequence > first.sequence + 50)
         # It obeys: a target off the default pose is reached, at the joint that was meant.
         target = torch.tensor(constants.DEFAULT_POSE)
         target[constants.JOINT_NAMES.index("FL_calf_joint")] += 0.3
@@ -125,14 +119,14 @@ def test_two_processes_and_a_robot_that_falls_silent(dds: None) -> None:
             transport.send(command)
             return float(transport.read().joint_position[2]) > constants.DEFAULT_POSE[2] + 0.15
 
-        until(reached)
+        assert until(reached)
         robot._process.send_signal(signal.SIGSTOP)
         time.sleep(0.2)
         last = transport.read()
         time.sleep(0.3)
         assert transport.read().time == last.time, "a stopped robot says nothing: its state grows old"
         robot._process.send_signal(signal.SIGCONT)
-        until(lambda: transport.read().sequence > last.sequence)
+        assert until(lambda: transport.read().sequence > last.sequence)
         transport.close()
     assert robot._process.returncode == 0
 

@@ -8,7 +8,7 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -25,16 +25,10 @@ from agility_rl.deploy.safety import SafetyLimits
 from agility_rl.deploy.simulated import SimulatedRobot
 from agility_rl.deploy.transport import JointCommand, RobotState
 from agility_rl.go2 import constants
+from tests.waiting import until
 
 DOMAIN = 1 + os.getpid() % 900
 """Tests that run at the same time must not command each other's robots."""
-
-
-def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -63,11 +57,11 @@ def test_states_come_and_commands_arrive(robot: LCMRobot, url: str) -> None:
     transport = LCMTransport(url, patience=60.0)
     assert tuple(transport.joint_names) == constants.JOINT_NAMES
     first = transport.read()
-    until(lambda: transport.read().sequence > first.sequence)
+    assert until(lambda: transport.read().sequence > first.sequence)
     assert first.time < transport.read().time <= time.monotonic() and transport.other_commanders() == ()
     gains = torch.full((12,), 31.0), torch.full((12,), 2.0)
     transport.send(JointCommand(torch.arange(12.0), *gains))
-    until(lambda: robot.robot.model.actuator_gainprm[0, 0] == 31.0)
+    assert until(lambda: robot.robot.model.actuator_gainprm[0, 0] == 31.0)
     assert robot.robot.model.actuator_biasprm[0, 2] == -2.0
     assert robot.robot.data.ctrl.tolist() == list(range(12)), "our joints, in our order"
     assert transport.other_commanders() == () and robot.refused.count == transport.refused.count == 0
@@ -83,10 +77,10 @@ def test_a_second_commander_is_seen_by_both(robot: LCMRobot, url: str) -> None:
         two.send(JointCommand.damped(3.0))
         return bool(one.other_commanders()) and bool(two.other_commanders())
 
-    until(both_seen)
+    assert until(both_seen)
     assert one.other_commanders() == ("1 other program",)
     two.close()
-    until(lambda: one.send(JointCommand.damped(3.0)) or not one.other_commanders())
+    assert until(lambda: one.send(JointCommand.damped(3.0)) or not one.other_commanders())
     one.close()
 
 
@@ -102,16 +96,16 @@ def test_commands_of_another_version_for_another_robot_or_overtaken_do_nothing(r
     }
     line = connect(url)
     for count, (message, reason) in enumerate(refused.items(), 1):
-        until(
+        assert until(
             lambda message=message, count=count: robot.refused.count >= count or line.publish(COMMAND_CHANNEL, message)
         )
         assert reason in robot.refused.reason
         robot.refused.count = count
     assert not (robot.robot.model.actuator_gainprm[:, 0] == 99.0).any()
     line.publish(COMMAND_CHANNEL, good)
-    until(lambda: (robot.robot.model.actuator_gainprm[:, 0] == 99.0).all())
+    assert until(lambda: (robot.robot.model.actuator_gainprm[:, 0] == 99.0).all())
     limp = pack_command(JointCommand.damped(0.0), Sent(robot.name, 5, 9), 0.0)
-    until(lambda: line.publish(COMMAND_CHANNEL, limp) or "overtaken" in robot.refused.reason)
+    assert until(lambda: line.publish(COMMAND_CHANNEL, limp) or "overtaken" in robot.refused.reason)
     assert (robot.robot.model.actuator_gainprm[:, 0] == 99.0).all()
 
 
@@ -124,13 +118,13 @@ def test_states_of_another_version_or_robot_are_refused_with_the_reason(robot: L
         (newer, "its version is 2, expected 1"),
         (other, f"another robot speaks on {STATE_CHANNEL}"),
     ):
-        until(
+        assert until(
             lambda m=message, r=reason: (
                 (transport.read() and r in transport.refused.reason) or line.publish(STATE_CHANNEL, m)
             )
         )
     last = transport.read()
-    until(lambda: transport.read().sequence > last.sequence)
+    assert until(lambda: transport.read().sequence > last.sequence)
     transport.close()
 
 
@@ -161,19 +155,19 @@ def test_two_processes_and_either_falls_silent(url: str, artifact: Artifact) -> 
         patient = SafetyLimits(source_age={"operator": 1e6}, missed_deadlines=10**9, state_age=0.25)
         controller = Controller(transport, still, Operator(BehaviourCommand.of("walk"), 0.0), limits=patient)
         controller.request(Mode.STAND_UP)
-        until(lambda: controller.step().mode is Mode.READY)
+        assert until(lambda: controller.step().mode is Mode.READY)
         # It obeys: it stands in the default pose.
         pose = torch.tensor(constants.DEFAULT_POSE)
         assert (transport.read().joint_position - pose).abs().max() < 0.35 and controller.fault is None
         # The robot falls silent: its last state grows old, and the controller gives up.
         process._process.send_signal(signal.SIGSTOP)
-        until(lambda: controller.step().mode is Mode.DAMPING)
+        assert until(lambda: controller.step().mode is Mode.DAMPING)
         assert controller.fault is not None and controller.fault.check == "stale state", controller.fault
         process._process.send_signal(signal.SIGCONT)
         # The controller falls silent: the motors damp by themselves, and the legs give way under the trunk.
         hold = JointCommand(pose, torch.full((12,), 60.0), torch.full((12,), 3.0))
-        until(lambda: transport.send(hold) or float((transport.read().joint_position - pose).abs().max()) < 0.2)
-        until(lambda: float((transport.read().joint_position - pose).abs().max()) > 0.4)
+        assert until(lambda: transport.send(hold) or float((transport.read().joint_position - pose).abs().max()) < 0.2)
+        assert until(lambda: float((transport.read().joint_position - pose).abs().max()) > 0.4)
         transport.close()
     assert process._process.returncode == 0
 

@@ -29,6 +29,7 @@ from agility_rl.deploy.operator import Status
 from agility_rl.deploy.web_viewer import REPEATING, SINGLE, pages
 from agility_rl.go2.appearance import dress
 from agility_rl.go2.model import build_spec
+from tests.waiting import until
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = (
@@ -118,15 +119,6 @@ def open_page(tmp_path: Path) -> Iterator[Callable[[str], Page]]:
     yield begin
     for page in opened:
         page.close()
-
-
-def until(holds: Callable[[], Any], seconds: float = SLOW) -> bool:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if holds():
-            return True
-        time.sleep(0.02)
-    return False
 
 
 def orange(picture: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from agility_rl.behaviours import BEHAVIOURS, skill_index
-from agility_rl.motion import MotionClip, MotionDataset, MotionError, load_clips
+from agility_rl.motion import MotionClip, MotionDataset, MotionError, load_clips, synthesize_gait
 from agility_rl.motion.clip import clip_from_joints
 from agility_rl.motion.dataset import discriminator_frames
 
@@ -174,6 +174,26 @@ def test_one_sided_labels_have_no_mirror_image(clips: dict[str, MotionClip], gen
     states = dataset.sample_states(torch.tensor([0] * 500 + [3] * 500), generator)
     turning = states["root_angular_velocity"][:, 2] > 0
     assert turning[500:].all() and not turning[:500].all()
+
+
+def test_labelled_clips_bent_to_both_sides_share_the_weight(generator: torch.Generator) -> None:
+    """A trot of 1 m/s at a half and the whole of 1.57 rad/s: five variants, whose turn rates a robot may be asked."""
+    trot = synthesize_gait("trot", speed=1.0)
+    dataset = MotionDataset([trot], [trot], turns=(0.5, 1.0))
+    assert [clip.weight for clip in dataset.labelled_clips] == pytest.approx([0.2] * 5)
+    assert dataset.class_seconds() == MotionDataset([trot], [trot]).class_seconds()
+    rates = [float(clip.root_angular_velocity[:, 2].mean()) for clip in dataset.labelled_clips]
+    assert rates == pytest.approx([0.0, -0.785, 0.785, -1.57, 1.57], rel=0.06, abs=0.02)
+    states = dataset.sample_states(torch.full((500,), skill_index("trot")), generator)
+    assert (states["root_angular_velocity"][:, 2].abs() > 0.3).float().mean() == pytest.approx(0.8, abs=0.08)
+
+
+def test_no_clip_is_bent_tighter_than_half_a_metre() -> None:
+    walk = synthesize_gait("walk", speed=0.2)  # 1 rad/s would be a radius of 0.2 m
+    rates = [
+        clip.root_angular_velocity[:, 2].mean() for clip in MotionDataset([walk], [walk], turns=(1,)).labelled_clips
+    ]
+    assert max(rates) == pytest.approx(0.4, rel=0.1)
 
 
 def test_features_are_those_of_the_policy(make_clip: ClipMaker) -> None:

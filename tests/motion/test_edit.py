@@ -9,8 +9,9 @@ import torch
 
 from agility_rl import rotations
 from agility_rl.go2 import constants, kinematics
+from agility_rl.motion import synthesize_gait
 from agility_rl.motion.clip import MotionClip, MotionError, central_difference, clip_from_joints
-from agility_rl.motion.edit import floor_height, foot_slip, ground, mirror, resample
+from agility_rl.motion.edit import bend, curvature_limits, floor_height, foot_slip, ground, mirror, resample
 from agility_rl.motion.formats import load_clip
 
 
@@ -70,6 +71,58 @@ def test_a_mirror_image_turns_the_other_way(make_clip: Callable[..., MotionClip]
     assert torch.allclose(image_roll, -roll, atol=1e-6)
     assert torch.allclose(image_pitch, pitch, atol=1e-6)
     assert torch.allclose(image_yaw, -yaw, atol=1e-6)
+
+
+@pytest.fixture
+def trotting() -> MotionClip:
+    return synthesize_gait("trot")
+
+
+def test_a_path_bent_by_nothing_is_the_path(trotting: MotionClip) -> None:
+    image = bend(trotting, 0.0)
+    for name in ("root_position", "joint_position", "foot_position"):
+        assert torch.allclose(getattr(image, name), getattr(trotting, name), atol=2e-5), name
+
+
+def test_a_bent_path_is_an_arc_and_the_trunk_turns_along(trotting: MotionClip) -> None:
+    """The trunk's track lies on a circle of radius 1 / curvature around a centre to the left, at unchanged heights."""
+    curvature = 0.8
+    image = bend(trotting, curvature)
+    straight = trotting.root_position[:, :2] - trotting.root_position[0, :2]
+    course = torch.atan2(straight[-1, 1], straight[-1, 0])
+    centre = trotting.root_position[0, :2] + torch.stack((-course.sin(), course.cos())) / curvature
+    across = straight @ torch.stack((-course.sin(), course.cos()))
+    radius = (image.root_position[:, :2] - centre).norm(dim=-1)
+    assert torch.allclose(radius, 1 / curvature - across, atol=1e-4)
+    assert torch.allclose(image.root_position[:, 2], trotting.root_position[:, 2])
+    along = straight @ torch.stack((course.cos(), course.sin()))
+    yaw = rotations.to_euler(image.root_quaternion)[2] - rotations.to_euler(trotting.root_quaternion)[2]
+    assert torch.allclose(rotations.wrap_angle(yaw - curvature * along), torch.zeros_like(yaw), atol=1e-4)
+    for turned, kept in zip(
+        rotations.to_euler(image.root_quaternion)[:2], rotations.to_euler(trotting.root_quaternion)[:2], strict=True
+    ):
+        assert torch.allclose(turned, kept, atol=1e-4)
+
+
+def test_standing_feet_stand_on_a_bent_path_too(trotting: MotionClip) -> None:
+    image = bend(trotting, 1.0)
+    assert torch.equal(image.foot_contact, trotting.foot_contact)
+    assert foot_slip(image).mean == pytest.approx(foot_slip(trotting).mean, abs=0.02)
+    assert torch.allclose(image.foot_position[..., 2], trotting.foot_position[..., 2], atol=1e-4)
+
+
+def test_a_path_bent_to_the_right_is_the_mirror_image_of_one_bent_to_the_left(trotting: MotionClip) -> None:
+    right, left = mirror(bend(mirror(trotting), 0.7)), bend(trotting, -0.7)
+    for name in ("root_position", "joint_position", "root_angular_velocity"):
+        assert torch.allclose(getattr(right, name), getattr(left, name), atol=2e-3), name
+
+
+def test_a_path_is_not_bent_until_it_crosses_itself(trotting: MotionClip) -> None:
+    low, high = curvature_limits(trotting)
+    bend(trotting, high)
+    for curvature in (high * 1.01, low * 1.01):
+        with pytest.raises(MotionError, match=r"curvature .*, expected -\d\.\d\d to \d\.\d\d"):
+            bend(trotting, curvature)
 
 
 def test_grounding_lifts_the_floor_and_keeps_the_flight(hop: MotionClip) -> None:

@@ -54,7 +54,7 @@ def test_every_row_is_labelled_by_the_teacher_of_its_behaviour(module: Module, p
     chosen = tuple((name, second if name in ("pace", "jump") else first) for name in reversed(BEHAVIOURS))
     teachers = distill.load_teachers(replace(distill.PRESETS["smoke"], teachers=chosen))
     td = observations()
-    said = distill.labeller(teachers)(td)
+    said = distill.labeller(teachers, ())(td)
     assert not said.requires_grad
     for row in range(10):
         bbc = module("rollouts").load_controller(second if row % 5 in (1, 4) else first).bbc
@@ -107,3 +107,18 @@ def test_the_command_line_takes_pairs_and_gives_one_line_errors(
     assert stop.value.code == 2
     errors = capsys.readouterr().err
     assert "nowhere" in errors and "Traceback" not in errors
+
+
+def test_a_steered_teacher_labels_the_curve(module: Module, pair: tuple[Path, Path]) -> None:
+    """Where a turn is commanded the label of a steered behaviour differs from its teacher's own; others do not."""
+    distill, (first, _) = module("bbc_distill"), pair
+    teachers = distill.load_teachers(
+        replace(distill.PRESETS["smoke"], teachers=tuple((name, first) for name in BEHAVIOURS))
+    )
+    td = observations()
+    plain, led = distill.labeller(teachers, ())(td), distill.labeller(teachers, ("pace",))(td)
+    pacing = td[keys.SKILL] == BEHAVIOURS.index("pace")
+    assert torch.equal(led[~pacing], plain[~pacing])
+    assert (led[pacing] - plain[pacing]).abs().amax(-1).min() > 1e-3 and led.isfinite().all()
+    with pytest.raises(ValueError, match="--steered: unknown gallop"):
+        distill.load_teachers(replace(distill.PRESETS["smoke"], steered=("gallop",)))

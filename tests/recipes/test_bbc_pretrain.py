@@ -184,12 +184,15 @@ def test_an_anchor_holds_the_policy_to_the_one_it_started_from(
     batch = parts.rollout.collect(parts.bbc.privileged_policy()).flatten()[:32]
     recipe.hold(parts, batch)
     parts.bbc.load_state_dict(parts.anchor.state_dict())
-    assert recipe.distance_to_anchor(parts, batch) == 0.0
+    assert recipe.distance_to_anchor(parts, batch, None) == 0.0
     linear = [layer for layer in parts.bbc.actor.modules() if isinstance(layer, torch.nn.Linear)]
     with torch.no_grad():
         linear[-1].bias += 0.3  # moves every mean action by as much
-    distance = recipe.distance_to_anchor(parts, batch)
+    distance = recipe.distance_to_anchor(parts, batch, None)
     torch.testing.assert_close(distance, torch.tensor(0.09))
+    straight = (batch["command"][:, 2].abs() <= 0.4).float().mean()
+    assert 0.0 < straight < 1.0
+    torch.testing.assert_close(recipe.distance_to_anchor(parts, batch, 0.4), 0.09 * straight)
     distance.backward()
     assert all(parameter.grad is None for parameter in parts.anchor.parameters())
     assert any(parameter.grad is not None for parameter in parts.bbc.actor.parameters())

@@ -48,7 +48,7 @@ def test_an_evaluation_writes_numbers_tables_and_pictures(untrained: Path, recip
 
 def test_a_missing_folder_is_one_line(tmp_path: Path, command, evaluate: ModuleType) -> None:
     result = command("evaluate", tmp_path / "nowhere")
-    assert result.returncode == 2 and "check the path" in result.stdout
+    assert result.returncode == 2 and "check the path" in result.stderr
     assert "Traceback" not in result.stderr
     with pytest.raises(FileNotFoundError, match=r"manifest\.json is missing"):
         evaluate.load_controller(tmp_path)

@@ -82,5 +82,5 @@ def test_impossible_options_and_empty_folders(recipe: ModuleType, screen: Consol
 def test_the_command_line_reports_a_missing_path_in_one_line(tmp_path: Path, command) -> None:
     result = command("inspect_motion", tmp_path / "nowhere")
     assert result.returncode == 2
-    assert "found nothing; check the path" in result.stdout
+    assert "found nothing; check the path" in result.stderr
     assert "Traceback" not in result.stdout + result.stderr

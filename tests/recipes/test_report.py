@@ -39,4 +39,4 @@ def test_a_folder_that_is_no_run(tmp_path: Path, module) -> None:
 def test_a_damaged_evaluation_is_named(tmp_path: Path, command) -> None:
     (tmp_path / "evaluation.json").write_text("{")
     result = command("report", tmp_path)
-    assert result.returncode == 2 and "evaluation.json is damaged" in result.stdout
+    assert result.returncode == 2 and "evaluation.json is damaged" in result.stderr
