@@ -1,8 +1,8 @@
 """Let a controller that only goes straight ahead walk along curves, by geometry: it lives in a straight world that is
 bent as a whole (``agility_rl/bending.py``), and neither its observations nor its feet leave that world.
 
-What it does so is rough (nothing balances the trunk in the curve, and a fast robot falls), but its steps are right: a
-teacher for ``bbc_distill.py``, after which PPO learns the balance. Source: ours.
+It leans into the curve by seeing itself lean out of it. What it does so is rough, and a fast robot still falls, but its
+steps are right: a teacher for ``bbc_distill.py``, after which PPO learns the balance. Source: ours.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ SLOWEST = 0.25
 """Slower robots turn as if they walked this fast [m/s]."""
 FARTHEST = 0.6
 """Most that a joint is moved by the bend [rad]: near a stretched leg inverse kinematics asks for anything."""
+LEAN = 3.0
+"""Roll error that the controller is shown in a curve, in units of the lean that balances the centrifugal force,
+v |w| / g. It answers an error by a part of it only: with 3 a pace fell half as often as with 1 (11 and 21 of 32)."""
 STEP = 0.01
 """Seconds of motion by which the speed of a bent joint is measured."""
 SPEED, TURN = COMMANDS.index("velocity_x"), COMMANDS.index("yaw_rate")
@@ -58,7 +61,9 @@ def straighten(observation: TensorDictBase) -> TensorDictBase:
     parts["joint_velocity"][:] = (after - before) / (2 * STEP) * features.JOINT_VELOCITY_SCALE
     target = move_joints(parts["last_action"] * scale + pose, curvature, straighten_points)
     parts["last_action"][:] = (target - pose) / scale
-    parts["angular_velocity"][:, 2] -= curvature * command[:, SPEED] * features.ANGULAR_VELOCITY_SCALE
+    turn = curvature * command[:, SPEED]
+    parts["angular_velocity"][:, 2] -= turn * features.ANGULAR_VELOCITY_SCALE
+    parts["roll_pitch"][:, 0] += LEAN * command[:, SPEED] * turn / constants.GRAVITY
     command[:, TURN] = 0.0
     observation[keys.PROPRIOCEPTION], observation[keys.COMMAND] = proprioception, command
     return observation

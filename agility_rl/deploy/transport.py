@@ -56,8 +56,8 @@ class RobotState:
             joint_position=torch.tensor(constants.DEFAULT_POSE),
             joint_velocity=torch.zeros(constants.NUM_JOINTS),
             joint_torque=torch.zeros(constants.NUM_JOINTS),
-            foot_force=torch.full((len(constants.LEGS),), 9.81 * constants.TOTAL_MASS / 4),
-            linear_acceleration=torch.tensor([0.0, 0.0, 9.81]),
+            foot_force=torch.full((len(constants.LEGS),), constants.GRAVITY * constants.TOTAL_MASS / 4),
+            linear_acceleration=torch.tensor([0.0, 0.0, constants.GRAVITY]),
         )
 
 

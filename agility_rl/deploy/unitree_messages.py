@@ -239,7 +239,7 @@ class FootCalibration:
         if load <= 0.0:
             raise ValueError(f"expected more counts standing than hanging, got {load:.1f} more; are the sensors alive?")
         front_left, front_right, rear_left, rear_right = hanging.tolist()
-        return cls((front_left, front_right, rear_left, rear_right), 9.81 * mass / load)
+        return cls((front_left, front_right, rear_left, rear_right), constants.GRAVITY * mass / load)
 
     def force(self, counts: Tensor) -> Tensor:
         """Forces ``[4]`` [N] of counts ``[4]``, both in our order of legs."""

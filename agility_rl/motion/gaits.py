@@ -20,7 +20,6 @@ from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.go2 import constants, kinematics
 from agility_rl.motion.clip import CONTROL_DT, MotionClip, MotionError, clip_from_joints
 
-GRAVITY = 9.81
 MAX_HALF_STANCE = 0.16
 """A foot stays at most this far [m] in front of or behind its neutral place; faster gaits shorten the stance."""
 JUMP_CLEARANCE = 0.06
@@ -255,8 +254,8 @@ def _jump_timing(
     take_off = pattern.height
     if not take_off + 0.05 <= peak <= 0.6:
         raise MotionError(f"jump: expected a trunk peak of {take_off + 0.05:.2f} to 0.60 m, got {peak}")
-    launch = math.sqrt(2 * GRAVITY * (peak - take_off))
-    flight = 2 * launch / GRAVITY
+    launch = math.sqrt(2 * constants.GRAVITY * (peak - take_off))
+    flight = 2 * launch / constants.GRAVITY
     lag = 0.16
     stance = min(0.28, 2 * MAX_HALF_STANCE / max(abs(speed), 1e-6))
     on_ground = lag + stance
@@ -268,7 +267,7 @@ def _jump_timing(
     quartic = (slope - 2 * depth) / 2
     ground = take_off - depth + (depth - quartic) * tau.square() + quartic * tau.pow(4)
     air_time = inside - on_ground
-    air = take_off + launch * air_time - GRAVITY * air_time.square() / 2
+    air = take_off + launch * air_time - constants.GRAVITY * air_time.square() / 2
     return _Schedule(
         period=period,
         touchdown=torch.tensor([0.0, 0.0, lag, lag], dtype=torch.float64),

@@ -13,8 +13,6 @@ from agility_rl import rotations
 from agility_rl.go2 import constants, kinematics
 from agility_rl.motion.clip import MotionClip, MotionError
 
-GRAVITY = 9.81
-
 
 def joint_targets(
     clip: MotionClip,
@@ -59,7 +57,7 @@ def joint_targets(
     up = rotations.rotate_inverse(clip.root_quaternion, upright)
     standing = clip.foot_contact.to(up.dtype)
     share = standing / standing.sum(-1, keepdim=True).clamp(min=1.0)
-    force = constants.TOTAL_MASS * GRAVITY * share[..., None] * up[:, None]
+    force = constants.TOTAL_MASS * constants.GRAVITY * share[..., None] * up[:, None]
     torque = -(foot_jacobian(clip.joint_position).mT @ force[..., None])[..., 0].flatten(-2)
     follower = clip.joint_position + (damping * clip.joint_velocity + load * torque) / stiffness
     return torch.cat((follower[1:], follower[-1:]))

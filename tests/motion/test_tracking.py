@@ -10,7 +10,7 @@ import torch
 from agility_rl.go2 import constants, kinematics
 from agility_rl.motion import synthesize_gait
 from agility_rl.motion.clip import MotionClip, MotionError, clip_from_joints
-from agility_rl.motion.tracking import GRAVITY, foot_jacobian, joint_targets
+from agility_rl.motion.tracking import foot_jacobian, joint_targets
 from agility_rl.simulation import make_simulator
 
 POSE = torch.tensor(constants.DEFAULT_POSE)
@@ -40,7 +40,7 @@ def test_standing_adds_the_static_torque() -> None:
     # A calf carries m g / 4 with the horizontal distance from knee to foot as its lever.
     added = constants.STIFFNESS * (joint_targets(still(constants.STANDING_HEIGHT), load=1.0) - POSE)[0, 2]
     foot, knee = kinematics.forward(POSE)[0, 0], constants.HIP_OFFSET_X - constants.THIGH * math.sin(0.9)
-    expected = constants.TOTAL_MASS * GRAVITY / 4.0 * (foot - knee)
+    expected = constants.TOTAL_MASS * constants.GRAVITY / 4.0 * (foot - knee)
     torch.testing.assert_close(added.abs(), expected.abs(), rtol=1e-4, atol=0.0)
     assert added > 0.0  # the knee is asked to be straighter
 

@@ -72,8 +72,11 @@ def test_a_controller_sees_its_own_straight_world(steering: ModuleType) -> None:
     )
     torch.testing.assert_close(seen[keys.PROPRIOCEPTION][:, part["last_action"]], action, atol=1e-3, rtol=0)
     assert seen[keys.PROPRIOCEPTION][:, part["angular_velocity"]].abs().max() < 1e-6
-    for name in ("roll_pitch", "foot_contact"):
-        assert torch.equal(seen[keys.PROPRIOCEPTION][:, part[name]], td[keys.PROPRIOCEPTION][:, part[name]])
+    contact = part["foot_contact"]
+    assert torch.equal(seen[keys.PROPRIOCEPTION][:, contact], td[keys.PROPRIOCEPTION][:, contact])
+    outward = seen[keys.PROPRIOCEPTION][:, part["roll_pitch"]] - td[keys.PROPRIOCEPTION][:, part["roll_pitch"]]
+    leaning = torch.tensor([steering.LEAN * 1.0 * 1.0 / 9.81, 0.0]).expand(8, 2)
+    torch.testing.assert_close(outward, leaning, atol=1e-6, rtol=0)
 
 
 def test_speeds_of_straightened_joints_are_the_derivatives_of_their_positions(steering: ModuleType) -> None:
