@@ -148,7 +148,7 @@ def load_script(script: str, bbc: Path | None) -> Decider:
 
     Args:
         script: ``BEHAVIOUR:SPEED``, speed in m/s.
-        bbc: folder of the controller; the pretrained one by default.
+        bbc: folder of the controller; that of the teachers by default.
 
     Raises:
         ValueError: if it is no such text, or the behaviour has no such speed.

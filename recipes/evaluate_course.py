@@ -63,7 +63,7 @@ class Config:
     script: str | None = None
     """BEHAVIOUR:SPEED, such as trot:1.2 [m/s], in place of it."""
     bbc: Path | None = None
-    """Folder of the Basic Behaviour Controller: that of the training by default, for a script the pretrained one."""
+    """Folder of the Basic Behaviour Controller: that of the training by default, for a script that of the teachers."""
     course: tuple[str, ...] = ()
     """Courses; by default the one that it was trained on, for a script ``full``."""
     disturbance: tuple[str, ...] = ("none",)

@@ -129,7 +129,7 @@ def load_bbc_of(trained: Trained, bbc: Path | None) -> Controller:
 
 
 def trained_bbc(run: Path) -> Path:
-    """Where a run's configuration says its controller was, else where the pretrained one is."""
+    """Where a run's configuration says its controller was, else where that of the teachers is."""
     file = run / "config.json"
     if not file.is_file():
         return TeacherConfig().bbc
