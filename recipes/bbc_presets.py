@@ -84,8 +84,8 @@ POLISH = replace(
     name="polish",
     iterations=90,
     changes=(),
-    motion=replace(CPU.motion, one_sided=("canter", "jump"), turns=(0.5, 1.0)),
-    env=replace(CPU.env, progress_weight=4.0, jump_weight=20.0, turn_weight=10.0),  # no fading: it walks already
+    motion=replace(CPU.motion, one_sided=("canter", "jump")),
+    env=replace(CPU.env, progress_weight=4.0, jump_weight=20.0),  # no fading: it walks already
     ppo=replace(
         CPU.ppo,
         learning_rate=1e-4,

@@ -317,9 +317,11 @@ def _with_mirror_images(clips: Sequence[MotionClip], but: Collection[str] = ()) 
 def _with_turns(clip: MotionClip, shares: Collection[float]) -> list[MotionClip]:
     """A labelled clip, and bent to either side at shares of its behaviour's largest commanded turn rate."""
     speed = float(clip.root_linear_velocity[:, :2].norm(dim=-1).mean())
+    if speed < STANDING_SPEED:
+        return [clip]  # it leads nowhere
     largest = COMMAND_RANGES[str(clip.label)].yaw_rate[1]
     low, high = curvature_limits(clip)
     low, high = max(low, -TIGHTEST), min(high, TIGHTEST)
-    wanted = [sign * share * largest / max(speed, 1e-6) for share in shares for sign in (-1.0, 1.0)]
+    wanted = [sign * share * largest / speed for share in shares for sign in (-1.0, 1.0)]
     part = replace(clip, weight=clip.weight / (1 + len(wanted)))
     return [part, *(bend(part, min(max(curvature, low), high)) for curvature in wanted)]

@@ -238,7 +238,8 @@ def _along_and_left(clip: MotionClip) -> tuple[Tensor, Tensor, Tensor]:
     """Columns of the clip's travel and of its left in the world ``[2, 2]``, and how far trunk and feet ``[T, 5]`` lie
     along both from where the trunk starts [m]."""
     travel = clip.root_position[-1, :2] - clip.root_position[0, :2]
-    cos, sin = torch.nn.functional.normalize(travel, dim=0).unbind()
+    course = torch.atan2(travel[1], travel[0])
+    cos, sin = course.cos(), course.sin()
     to_world = torch.stack((torch.stack((cos, -sin)), torch.stack((sin, cos))))
     points = torch.cat((clip.root_position[:, None], clip.foot_position), 1)[..., :2] - clip.root_position[0, :2]
     along, left = (points @ to_world).unbind(-1)

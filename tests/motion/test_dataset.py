@@ -196,6 +196,12 @@ def test_no_clip_is_bent_tighter_than_half_a_metre() -> None:
     assert max(rates) == pytest.approx(0.4, rel=0.1)
 
 
+def test_a_clip_that_leads_nowhere_is_not_bent(make_clip: ClipMaker) -> None:
+    clip = make_clip(label="walk")
+    still = replace(clip, root_linear_velocity=torch.zeros_like(clip.root_linear_velocity))
+    assert [found.weight for found in MotionDataset([still], [still], turns=(0.5,)).labelled_clips] == [1.0]
+
+
 def test_features_are_those_of_the_policy(make_clip: ClipMaker) -> None:
     clip = make_clip()
     frames = discriminator_frames(clip)

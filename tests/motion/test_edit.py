@@ -117,6 +117,20 @@ def test_a_path_bent_to_the_right_is_the_mirror_image_of_one_bent_to_the_left(tr
         assert torch.allclose(getattr(right, name), getattr(left, name), atol=2e-3), name
 
 
+def test_a_clip_on_the_spot_keeps_its_feet_apart(trotting: MotionClip) -> None:
+    """No travel, no direction of it: the world's x is as good as any, and nothing may collapse."""
+    still = clip_from_joints(
+        "still",
+        0.02,
+        trotting.root_position[:1].repeat(3, 1),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1),
+        trotting.joint_position[:1].repeat(3, 1),
+    )
+    image = bend(still, 0.5)
+    assert torch.allclose(image.root_position, still.root_position)
+    assert (image.foot_position - still.foot_position).abs().max() < 0.05
+
+
 def test_a_path_is_not_bent_until_it_crosses_itself(trotting: MotionClip) -> None:
     low, high = curvature_limits(trotting)
     bend(trotting, high)
