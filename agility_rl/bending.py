@@ -16,6 +16,8 @@ import math
 import torch
 from torch import Tensor
 
+TIGHTEST = 2.0
+"""Largest curvature [1/m] that a robot of this size is led along: half a metre is a little more than its length."""
 STRAIGHT = 1e-5
 """Smaller curvatures [1/m] are taken as this when an arc is straightened: over a metre they move a point by 10 um."""
 

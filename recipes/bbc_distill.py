@@ -32,7 +32,7 @@ from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.envs import LocomotionEnv
-from agility_rl.go2 import features
+from agility_rl.go2 import constants, features
 from agility_rl.losses import AdaptationLoss, StateEstimationLoss
 from agility_rl.modules import BasicBehaviourController
 from agility_rl.training import cli
@@ -113,8 +113,12 @@ def labeller(teachers: list[Controller], lead: Collection[str]) -> Act:
 
     @torch.no_grad()
     def label(observation: TensorDictBase) -> Tensor:
-        said = torch.stack([act(observation) for act in acts.values()])
-        return said[index[observation[keys.SKILL]], torch.arange(len(observation))]
+        teacher = index[observation[keys.SKILL]]
+        said = torch.empty(len(observation), constants.NUM_JOINTS)
+        for number, act in enumerate(acts.values()):
+            rows = teacher == number
+            said[rows] = act(observation[rows])
+        return said
 
     return label
 

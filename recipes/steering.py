@@ -15,12 +15,10 @@ from torch import Tensor
 
 from agility_rl import keys
 from agility_rl.behaviours import COMMANDS
-from agility_rl.bending import bend_points, straighten_points
+from agility_rl.bending import TIGHTEST, bend_points, straighten_points
 from agility_rl.go2 import constants, features
 from agility_rl.go2.kinematics import forward, inverse
 
-TIGHTEST = 2.0
-"""Largest curvature [1/m]; half a metre is a little more than the robot's length."""
 SLOWEST = 0.25
 """Slower robots turn as if they walked this fast [m/s]."""
 FARTHEST = 0.6

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS, COMMAND_RANGES, NUM_BEHAVIOURS
+from agility_rl.bending import TIGHTEST
 from agility_rl.go2 import features as go2_features
 from agility_rl.motion.clip import CONTROL_DT, MotionClip, MotionError
 from agility_rl.motion.edit import bend, curvature_limits, resample
@@ -25,9 +26,6 @@ FrameFeatures = Callable[[MotionClip], Tensor]
 
 STANDING_SPEED = 0.1
 """Slower dogs stand [m/s]."""
-
-TIGHTEST = 2.0
-"""Largest curvature to which a clip is bent [1/m]: half a metre is a little more than the robot's length."""
 
 _STATE = (
     "root_quaternion",
@@ -77,8 +75,9 @@ class MotionDataset:
         one_sided: labels whose labelled clips are not mirrored: a canter has a leading leg, and who is shown it on
             both sides may end between them, in a bound.
         turns: also draw from every labelled clip bent to either side, at these shares of the largest turn rate that
-            may be commanded of its behaviour (as far as its path and :data:`TIGHTEST` allow), each variant with an
-            equal part of its weight: labelled clips that lead straight ahead teach that turning is no dog's.
+            may be commanded of its behaviour (as far as its path and :data:`~agility_rl.bending.TIGHTEST` allow), each
+            variant with an equal part of its weight: labelled clips that lead straight ahead teach that turning is no
+            dog's.
         features: maps a clip to the features of its frames.
         standing_weight: factor on the weight of unlabelled frames in which the dog stands, which a dog does a third of
             the time: mean speed of the second around them below 0.1 m/s.
