@@ -60,6 +60,8 @@ class EnvConfig:
     """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
     episode_length: float = 20.0
     """Seconds until an episode is cut; shorter ones start more often in the middle of a dog's motion."""
+    standing_starts: float = 0.0
+    """Share of episodes that start from a stand instead of the middle of a dog's motion, as a course does."""
     end_when_sitting: bool = False
     """Contact of a thigh ends the episode too, as in stage 3."""
     friction_loss: float = 0.2

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from bbc_cloning import Demonstrations
-from bbc_config import Config, EnvConfig, MotionConfig
+from bbc_config import Config
+from bbc_world import load_motion, make_env
 from held_fixed import INFERRED, privileged_loss
-from identified import load_simulator
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -22,16 +20,7 @@ from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.envs import LocomotionEnv
-from agility_rl.envs.randomization import NOMINAL, Randomization, sample_parameters
-from agility_rl.envs.rewards import (
-    LOCOMOTION_REWARDS,
-    RewardTerm,
-    jump_height_peak,
-    jump_height_window,
-    turn_progress,
-    velocity_progress,
-)
-from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, thigh_contact
+from agility_rl.envs.randomization import NOMINAL, sample_parameters
 from agility_rl.go2 import features
 from agility_rl.losses import AdaptationLoss, DiscriminatorLoss, PredictorLoss, StateEstimationLoss, functional
 from agility_rl.modules import (
@@ -42,9 +31,7 @@ from agility_rl.modules import (
     Predictor,
     SkillPrior,
 )
-from agility_rl.motion import MotionDataset, load_clips
-from agility_rl.motion.gaits import synthetic_dataset_clips
-from agility_rl.simulation import HeightField, rough_pyramids
+from agility_rl.motion import MotionDataset
 from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.ppo import PPOUpdate
 from agility_rl.training.rollout import Rollout
@@ -97,39 +84,7 @@ def build(cfg: Config) -> Components:
     """Construct data, environment, networks, losses and optimisers."""
     seeds, im, ppo = seed_everything(cfg.seed), cfg.imitation, cfg.ppo
     dataset = load_motion(cfg.motion, cfg.seed)
-    terms = dict(LOCOMOTION_REWARDS)
-    peak = partial(jump_height_peak, width=cfg.env.jump_width)
-    jump = {"peak": peak, "window": jump_height_window}[cfg.env.jump_reward]
-    terms["jump_height"] = RewardTerm(cfg.env.jump_weight, jump)
-    if cfg.env.progress_weight:
-        terms["velocity_progress"] = RewardTerm(cfg.env.progress_weight, velocity_progress)
-    if cfg.env.turn_weight:
-        terms["turn_progress"] = RewardTerm(cfg.env.turn_weight, turn_progress)
-    terms["collision"] = terms["collision"]._replace(weight=cfg.env.collision_weight)
-    skills = torch.arange(len(BEHAVIOURS)).repeat_interleave(2000)
-    reference = dataset.sample_states(skills, seeds.generator("reference"))
-    randomization = Randomization() if cfg.env.randomize else NOMINAL if cfg.env.action_delay else None
-    model: dict[str, Any] = {"friction_loss": cfg.env.friction_loss}
-    if cfg.env.simulator is not None:
-        simulator = load_simulator(cfg.env.simulator)
-        randomization, model = simulator.randomization, model | dict(simulator.model)
-    env = LocomotionEnv(
-        cfg.env.num_robots,
-        simulator_options={
-            "num_threads": cfg.env.num_threads,
-            **model,
-            "terrain": make_terrain(cfg.env, seeds.generator("terrain")),
-        },
-        reference=reference.set("skill", skills),
-        rewards=terms,
-        terminations=(*LOCOMOTION_TERMINATIONS, *([thigh_contact] if cfg.env.end_when_sitting else [])),
-        randomization=randomization,
-        observation_noise=cfg.env.observation_noise,
-        push_interval=cfg.env.push_interval,
-        episode_length=cfg.env.episode_length,
-        motion_offsets=cfg.motion.offsets,
-        seed=seeds.integer("environment"),
-    )
+    env = make_env(cfg, dataset, seeds)
     bbc = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std)
     anchor = None
     if im.anchor:
@@ -247,32 +202,6 @@ def build(cfg: Config) -> Components:
             lr=cfg.adaptation.learning_rate,
             fused=True,
         ),
-    )
-
-
-def make_terrain(cfg: EnvConfig, generator: torch.Generator) -> HeightField | None:
-    """The height field, or nothing for flat ground."""
-    if cfg.terrain == "flat":
-        return None
-    return rough_pyramids(generator, noise=cfg.roughness, slope=cfg.steepness)
-
-
-def load_motion(cfg: MotionConfig, seed: int) -> MotionDataset:
-    """The clips of the given folders, or the synthetic gaits when there are none."""
-    if (cfg.labelled is None) != (cfg.unlabelled is None):
-        raise ValueError("give both --motion.labelled and --motion.unlabelled, or neither for synthetic gaits")
-    if cfg.labelled is None or cfg.unlabelled is None:
-        labelled, unlabelled = synthetic_dataset_clips(seed)
-    else:
-        labelled, unlabelled = load_clips(cfg.labelled, label="from name"), load_clips(cfg.unlabelled)
-    return MotionDataset(
-        labelled,
-        unlabelled,
-        offsets=cfg.offsets,
-        mirror=cfg.mirror,
-        standing_weight=cfg.standing_weight,
-        one_sided=cfg.one_sided,
-        turns=cfg.turns,
     )
 
 

@@ -7,7 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from agility_rl import behaviours
-from agility_rl.go2 import constants
+from agility_rl.go2 import constants, features
 
 STATE_ENTRIES = (
     "root_height",
@@ -19,6 +19,40 @@ STATE_ENTRIES = (
 )
 PAST = "past_motion"
 """Discriminator frames before the state, oldest first."""
+
+
+def standing_states(skill: Tensor, span: int = 0) -> TensorDict:
+    """Standing in the default pose, for as long as discriminator frames look back.
+
+    Source: ours; a robot that is switched on, or put before a course, starts like this and not in mid-stride.
+
+    Args:
+        skill: int64 ``[M]``, the behaviours that start from there.
+        span: number of past motion frames [control steps].
+
+    Returns:
+        ``[M]`` with the entries of :class:`ReferenceStates`; ``past_motion`` ``[M, span, 49]`` if ``span`` is not 0.
+
+    Example:
+        >>> standing_states(torch.tensor([0, 4]), span=24)["past_motion"].shape
+        torch.Size([2, 24, 49])
+    """
+    n = len(skill)
+    states = TensorDict(
+        {
+            "root_height": torch.full((n, 1), constants.STANDING_HEIGHT),
+            "root_quaternion": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
+            "root_linear_velocity": torch.zeros(n, 3),
+            "root_angular_velocity": torch.zeros(n, 3),
+            "joint_position": torch.tensor(constants.DEFAULT_POSE).repeat(n, 1),
+            "joint_velocity": torch.zeros(n, constants.NUM_JOINTS),
+        },
+        [n],
+    )
+    height, *rest = (states[name] for name in STATE_ENTRIES)
+    if span:
+        states[PAST] = features.clip_frames(height[:, 0], *rest)[:, None].repeat(1, span, 1)
+    return states.set("skill", skill)
 
 
 class ReferenceStates:
@@ -67,21 +101,7 @@ class ReferenceStates:
     @classmethod
     def standing(cls) -> ReferenceStates:
         """One state for all behaviours: standing in the default pose."""
-        n = behaviours.NUM_BEHAVIOURS
-        return cls(
-            TensorDict(
-                {
-                    "skill": torch.arange(n),
-                    "root_height": torch.full((n, 1), constants.STANDING_HEIGHT),
-                    "root_quaternion": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
-                    "root_linear_velocity": torch.zeros(n, 3),
-                    "root_angular_velocity": torch.zeros(n, 3),
-                    "joint_position": torch.tensor(constants.DEFAULT_POSE).repeat(n, 1),
-                    "joint_velocity": torch.zeros(n, constants.NUM_JOINTS),
-                },
-                [n],
-            )
-        )
+        return cls(standing_states(torch.arange(behaviours.NUM_BEHAVIOURS)))
 
     def sample(self, skill: Tensor, generator: torch.Generator) -> TensorDictBase:
         """A random state of each given skill, ``[N]``."""

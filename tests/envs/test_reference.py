@@ -13,7 +13,8 @@ from tensordict import TensorDict
 from agility_rl import keys
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.locomotion import CLEARANCE
-from agility_rl.envs.reference import STATE_ENTRIES, ReferenceStates
+from agility_rl.envs.reference import STATE_ENTRIES, ReferenceStates, standing_states
+from agility_rl.go2 import features
 from agility_rl.go2.constants import DEFAULT_POSE
 
 
@@ -67,6 +68,22 @@ def test_standing_states_stand() -> None:
     # soles on the ground: thigh and calf of 0.213 m at 0.9 rad each, foot radius 0.022 m, foot offset -0.002 m
     sole = 2 * 0.213 * np.cos(0.9) + 0.022
     assert state["root_height"][0].item() == pytest.approx(sole, abs=2.5e-3)
+
+
+def test_a_stand_has_stood_before(build: Callable[..., LocomotionEnv]) -> None:
+    """The frames before a stand are those of the environment at its start, and no velocity is in them."""
+    reference = standing_states(torch.arange(5), span=8)
+    motion = build(3, reference=reference, motion_offsets=(0, 4, 8)).reset()[keys.MOTION]
+    torch.testing.assert_close(motion[:, 0], motion[:, 1])
+    height = features.layout_slice(features.MOTION_LAYOUT, "root_height")
+    feet = features.layout_slice(features.MOTION_LAYOUT, "foot_position")
+    other = torch.ones(motion.shape[-1], dtype=torch.bool)
+    other[height] = False  # the engine's robots are let down from a few millimetres above the ground
+    torch.testing.assert_close(motion[:, 0, other], motion[:, 2, other], atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(motion[:, 0, height] + CLEARANCE, motion[:, 2, height])
+    for name in ("linear_velocity", "angular_velocity", "joint_velocity"):
+        assert not motion[..., features.layout_slice(features.MOTION_LAYOUT, name)].any()
+    assert motion[..., feet].any()
 
 
 def test_errors_name_what_is_missing() -> None:

@@ -1,0 +1,110 @@
+"""The world in which a Basic Behaviour Controller is trained: recorded motion, ground, starts, rewards, robots."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import torch
+from bbc_config import Config, EnvConfig, MotionConfig
+from identified import load_simulator
+from tensordict import TensorDict
+
+from agility_rl.behaviours import BEHAVIOURS
+from agility_rl.envs import LocomotionEnv
+from agility_rl.envs.randomization import NOMINAL, Randomization
+from agility_rl.envs.reference import standing_states
+from agility_rl.envs.rewards import (
+    LOCOMOTION_REWARDS,
+    RewardTerm,
+    jump_height_peak,
+    jump_height_window,
+    turn_progress,
+    velocity_progress,
+)
+from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, thigh_contact
+from agility_rl.motion import MotionDataset, load_clips
+from agility_rl.motion.gaits import synthetic_dataset_clips
+from agility_rl.simulation import HeightField, rough_pyramids
+from agility_rl.training.seeding import Seeds
+
+
+def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv:
+    """Robots that start in the middle of the dogs' motion."""
+    reference = starts(cfg, dataset, seeds.generator("reference"))
+    randomization = Randomization() if cfg.env.randomize else NOMINAL if cfg.env.action_delay else None
+    model: dict[str, Any] = {"friction_loss": cfg.env.friction_loss}
+    if cfg.env.simulator is not None:
+        simulator = load_simulator(cfg.env.simulator)
+        randomization, model = simulator.randomization, model | dict(simulator.model)
+    return LocomotionEnv(
+        cfg.env.num_robots,
+        simulator_options={
+            "num_threads": cfg.env.num_threads,
+            **model,
+            "terrain": make_terrain(cfg.env, seeds.generator("terrain")),
+        },
+        reference=reference,
+        rewards=rewards(cfg.env),
+        terminations=(*LOCOMOTION_TERMINATIONS, *([thigh_contact] if cfg.env.end_when_sitting else [])),
+        randomization=randomization,
+        observation_noise=cfg.env.observation_noise,
+        push_interval=cfg.env.push_interval,
+        episode_length=cfg.env.episode_length,
+        motion_offsets=cfg.motion.offsets,
+        seed=seeds.integer("environment"),
+    )
+
+
+def rewards(cfg: EnvConfig) -> dict[str, RewardTerm]:
+    """The terms of supplement S4, weighted as the options say, with those of ours that have a weight."""
+    terms = dict(LOCOMOTION_REWARDS)
+    jump = {"peak": partial(jump_height_peak, width=cfg.jump_width), "window": jump_height_window}[cfg.jump_reward]
+    terms["jump_height"] = RewardTerm(cfg.jump_weight, jump)
+    if cfg.progress_weight:
+        terms["velocity_progress"] = RewardTerm(cfg.progress_weight, velocity_progress)
+    if cfg.turn_weight:
+        terms["turn_progress"] = RewardTerm(cfg.turn_weight, turn_progress)
+    terms["collision"] = terms["collision"]._replace(weight=cfg.collision_weight)
+    return terms
+
+
+def starts(cfg: Config, dataset: MotionDataset, generator: torch.Generator, each: int = 2000) -> TensorDict:
+    """States to start an episode from, ``each`` of every behaviour: of dogs in motion, and standing ones.
+
+    Raises:
+        ValueError: if the share of standing ones is not between 0 and 1.
+    """
+    if not 0.0 <= cfg.env.standing_starts <= 1.0:
+        raise ValueError(f"--env.standing-starts: expected a share from 0 to 1, got {cfg.env.standing_starts}")
+    standing = round(each * cfg.env.standing_starts)
+    skills = torch.arange(len(BEHAVIOURS))
+    moving = skills.repeat_interleave(each - standing)
+    states = dataset.sample_states(moving, generator).set("skill", moving)
+    return torch.cat((states, standing_states(skills.repeat_interleave(standing), cfg.motion.offsets[-1])))
+
+
+def make_terrain(cfg: EnvConfig, generator: torch.Generator) -> HeightField | None:
+    """The height field, or nothing for flat ground."""
+    if cfg.terrain == "flat":
+        return None
+    return rough_pyramids(generator, noise=cfg.roughness, slope=cfg.steepness)
+
+
+def load_motion(cfg: MotionConfig, seed: int) -> MotionDataset:
+    """The clips of the given folders, or the synthetic gaits when there are none."""
+    if (cfg.labelled is None) != (cfg.unlabelled is None):
+        raise ValueError("give both --motion.labelled and --motion.unlabelled, or neither for synthetic gaits")
+    if cfg.labelled is None or cfg.unlabelled is None:
+        labelled, unlabelled = synthetic_dataset_clips(seed)
+    else:
+        labelled, unlabelled = load_clips(cfg.labelled, label="from name"), load_clips(cfg.unlabelled)
+    return MotionDataset(
+        labelled,
+        unlabelled,
+        offsets=cfg.offsets,
+        mirror=cfg.mirror,
+        standing_weight=cfg.standing_weight,
+        one_sided=cfg.one_sided,
+        turns=cfg.turns,
+    )
