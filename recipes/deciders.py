@@ -10,22 +10,20 @@ from typing import Any
 import torch
 from disturbances import Disturbance
 from rollouts import Controller, load_controller
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from tsc_artifacts import load_bbc_of, load_trained
 from tsc_config import Config as TeacherConfig
+from tsc_script import Script
 
 from agility_rl import behaviours, keys
 from agility_rl.envs import AgilityEnv
-from agility_rl.envs.decisions import NUM_PARAMETERS
 from agility_rl.envs.depth import DepthObservation
 from agility_rl.modules import RecurrentStudent
 from agility_rl.modules.student import NEXT_HIDDEN
 
 Decide = Callable[[TensorDictBase], TensorDictBase]
 """Observations of a course to decisions under ``action``."""
-STEERING = 2.0
-"""Turn rate that a script commands for each radian of heading error [1/s]."""
 
 
 class Senses:
@@ -143,34 +141,17 @@ def load_decider(
     )
 
 
-def load_script(script: str, bbc: Path | None) -> Decider:
-    """One behaviour at one speed, turned towards the way-point; everything else in the middle of its range.
+def load_script(text: str, bbc: Path | None) -> Decider:
+    """What a script decides.
 
     Args:
-        script: ``BEHAVIOUR:SPEED``, speed in m/s.
+        text: as :meth:`Script.parse` reads it.
         bbc: folder of the controller; that of the teachers by default.
 
     Raises:
-        ValueError: if it is no such text, or the behaviour has no such speed.
+        ValueError: if it is no script.
     """
-    name, _, number = script.partition(":")
-    try:
-        skill, speed = behaviours.skill_index(name), float(number)
-    except ValueError as error:
-        raise ValueError(f"--script: expected BEHAVIOUR:SPEED such as trot:1.2, got {script!r} ({error})") from None
-    low, high = behaviours.command_bounds()
-    slowest, fastest = low[skill, 0].item(), high[skill, 0].item()
-    if not slowest - 1e-6 <= speed <= fastest + 1e-6:
-        raise ValueError(f"--script: {name} goes at {slowest:g} to {fastest:g} m/s (Table S2), got {number} m/s")
-    turn = behaviours.COMMANDS.index("yaw_rate")
-
-    def decide(td: TensorDictBase) -> TensorDictBase:
-        n = len(td)
-        parameters = torch.zeros(n, behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS)
-        parameters[:, skill, 0] = 2.0 * (speed - slowest) / (fastest - slowest) - 1.0
-        parameters[:, skill, turn] = STEERING * td[keys.HEADING_ERROR][:, 0] / high[skill, turn]  # clipped by the env
-        decision = {keys.BEHAVIOUR: torch.full((n,), skill), keys.PARAMETERS: parameters}
-        return td.set(keys.ACTION, TensorDict(decision, td.batch_size))
-
-    label = f"script_{name}_{speed:g}"
-    return Decider(decide, 1, load_controller(bbc or TeacherConfig().bbc), label, None, None, "full", (name,))
+    script = Script.parse(text)
+    label = "script_" + text.replace(":", "_").replace(",", "_").replace("=", "_")
+    controller = load_controller(bbc or TeacherConfig().bbc)
+    return Decider(script.decide, 1, controller, label, None, None, "full", script.behaviours)

@@ -1,12 +1,13 @@
 """Measure a Task-Specific Controller on courses: does the robot pass them, how fast, and with which behaviours?
 
-In:  a run folder of ``tsc_teacher.py`` or ``tsc_student.py``, or its ``policy/`` folder; or a script, one behaviour at
-     one speed that turns towards the way-points: a baseline that needs only a Basic Behaviour Controller.
+In:  a run folder of ``tsc_teacher.py`` or ``tsc_student.py``, or its ``policy/`` folder; or a script, a behaviour
+     and a speed for each obstacle, turned towards the way-points: a baseline that needs only the controller below.
 Out: tables on the screen, ``RUN/course_evaluation.json``, ``RUN/figures/course_*.png``; an earlier one is replaced.
 
     python recipes/evaluate_course.py runs/my_teacher                    # the course that it was trained on
     python recipes/evaluate_course.py runs/my_teacher --course targets   # full, each obstacle alone, box, hurdles
     python recipes/evaluate_course.py --script trot:1.2 --course each --episodes 50
+    python recipes/evaluate_course.py --script trot:1.2,bar_jump=jump:1.4 --course bar_jump
     python recipes/evaluate_course.py runs/my_student --disturbance all  # rectangles, noise, ..., a late camera
 
 Courses: a preset, a .toml or .json file, ``each`` for every obstacle of the challenge alone, or ``targets``.
@@ -61,7 +62,7 @@ class Config:
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run or artifact folder of a teacher or student."""
     script: str | None = None
-    """BEHAVIOUR:SPEED, such as trot:1.2 [m/s], in place of it."""
+    """BEHAVIOUR:SPEED [m/s], such as trot:1.2, or trot:1.2,bar_jump=jump:1.4,... , in place of it."""
     bbc: Path | None = None
     """Folder of the Basic Behaviour Controller: that of the training by default, for a script that of the teachers."""
     course: tuple[str, ...] = ()
@@ -146,7 +147,7 @@ def check(config: Config) -> None:
             "expected either the folder of a teacher or student, or --script BEHAVIOUR:SPEED, such as trot:1.2"
         )
     if config.script is not None and config.behaviours is not None:
-        raise ValueError("--behaviours limits a teacher or student; a script has one behaviour already")
+        raise ValueError("--behaviours limits a teacher or student; a script says itself which it chooses")
 
 
 def evaluate(config: Config, console: Console) -> dict[str, Any]:

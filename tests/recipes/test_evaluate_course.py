@@ -16,7 +16,6 @@ import torch
 from rich.console import Console
 from tensordict import TensorDict
 
-from agility_rl import keys
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.envs import COURSES, AgilityEnv
 from agility_rl.envs.layout import CourseLayout
@@ -123,17 +122,6 @@ def test_fewer_behaviours(deciders: ModuleType, teacher: Path, untrained: Path) 
     free = deciders.load_decider(teacher, untrained, None)
     assert (decider.behaviours, len(free.behaviours)) == (("jump",), 5)
     assert len(set(free.decide(td)["action", "behaviour"].tolist())) > 1, "else the line above would show nothing"
-
-
-def test_a_script_commands_its_speed_and_turns_to_the_way_point(deciders: ModuleType, untrained: Path) -> None:
-    decider = deciders.load_script("trot:1.2", untrained)
-    td = TensorDict({keys.HEADING_ERROR: torch.tensor([[0.3, 0.0], [-0.3, 0.0]])}, [2])
-    action = decider.decide(td)["action"]
-    assert action["behaviour"].tolist() == [2, 2]
-    command, shift = deciders.behaviours.commands_from_parameters(action["behaviour"], action["parameters"][:, 2])
-    assert command[:, 0].tolist() == pytest.approx([1.2, 1.2])
-    assert command[:, 2].tolist() == pytest.approx([0.6, -0.6])  # 2 rad/s for each radian
-    assert command[:, 1].tolist() == pytest.approx([0.0, 0.0]) and shift.tolist() == [[0.0], [0.0]]
 
 
 def test_a_held_decision_is_what_the_environment_would_hold(

@@ -1,0 +1,64 @@
+"""Scripts: what they command, checked against the command ranges, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from agility_rl import keys
+from agility_rl.behaviours import BEHAVIOURS, commands_from_parameters
+from agility_rl.envs.obstacles import OBSTACLES
+
+
+@pytest.fixture
+def script(module: Callable[[str], ModuleType]) -> Any:
+    return module("tsc_script").Script
+
+
+def seen(obstacles: list[str], errors: list[float]) -> TensorDict:
+    kinds = torch.tensor([list(OBSTACLES).index(name) for name in obstacles])
+    td = {keys.OBSTACLE: torch.nn.functional.one_hot(kinds, len(OBSTACLES)).float()}
+    return TensorDict(td | {keys.HEADING_ERROR: torch.tensor([[error, 0.0] for error in errors])}, [len(kinds)])
+
+
+def test_a_script_commands_its_speed_and_turns_to_the_way_point(script: Any) -> None:
+    action = script.parse("trot:1.2").decide(seen(["tunnel", "seesaw", "seesaw"], [0.3, -0.3, 9.0]))["action"]
+    assert action["behaviour"].tolist() == [2, 2, 2]
+    command, shift = commands_from_parameters(action["behaviour"], action["parameters"][:, 2])
+    assert command[:, 0].tolist() == pytest.approx([1.2] * 3)
+    assert command[:, 2].tolist() == pytest.approx([0.6, -0.6, 1.57])  # 2 rad/s for each radian, up to Table S2's
+    assert command[:, 1].tolist() == pytest.approx([0.0] * 3) and not shift.any()
+    other, _ = commands_from_parameters(torch.tensor([0, 0, 0]), action["parameters"][:, 0])
+    assert other[:, 2].tolist() == pytest.approx([0.6, -0.6, 1.0])  # behaviours that were not chosen would turn too
+
+
+def test_obstacles_may_have_decisions_of_their_own(script: Any) -> None:
+    chosen = script.parse("walk:0.5,bar_jump=jump:1.4,tunnel=canter:0.8")
+    action = chosen.decide(seen(["bar_jump", "tunnel", "seesaw", "a_frame"], [0.0] * 4))["action"]
+    assert [BEHAVIOURS[index] for index in action["behaviour"]] == ["jump", "canter", "walk", "walk"]
+    parameters = action["parameters"].take_along_dim(action["behaviour"][:, None, None], 1)[:, 0]
+    command, _ = commands_from_parameters(action["behaviour"], parameters)
+    assert command[:, 0].tolist() == pytest.approx([1.4, 0.8, 0.5, 0.5])
+    assert command[0, 3].item() == pytest.approx(0.5)  # jumps half as high as they may
+    assert chosen.behaviours == ("walk", "canter", "jump")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("trot", r"--script: expected BEHAVIOUR:SPEED such as trot:1.2, got 'trot'"),
+        ("gallop:2", r"got 'gallop:2' \(.*gallop"),
+        ("trot:fast", r"got 'trot:fast'"),
+        ("trot:1.7", r"--script: trot goes at 0.5 to 1.5 m/s \(Table S2\), got 1.7 m/s"),
+        ("trot:1.2,hoop=jump:1.0", r"--script: unknown obstacle 'hoop' in .*, expected bar_jump, a_frame"),
+        ("trot:1.2,tunnel", r"expected BEHAVIOUR:SPEED such as trot:1.2"),
+    ],
+)
+def test_what_is_no_script_is_refused(script: Any, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        script.parse(text)
