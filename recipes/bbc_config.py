@@ -29,12 +29,13 @@ class MotionConfig:
 @dataclass(frozen=True)
 class EnvConfig:
     num_robots: int = 1024
-    terrain: Literal["flat", "rough"] = "flat"
-    """``flat`` or ``rough`` (method notes 4.5)."""
+    terrain: Literal["flat", "rough", "ridges"] = "flat"
+    """``flat``, ``rough`` (method notes 4.5), or ``ridges``: slopes without roughness (ours)."""
     roughness: float = 0.05
     """Half-width of the rough terrain's noise [m] (method notes, section 4.5)."""
     steepness: float = 0.4
-    """Slope of its pyramids at difficulty 1; they are drawn at 0, 0.2 and 0.4 of it (method notes, section 4.5)."""
+    """Slope of its pyramids at difficulty 1; they are drawn at 0, 0.2 and 0.4 of it (method notes, section 4.5). Of
+    ridges: the largest; strips have all of it, half of it or none."""
     randomize: bool = True
     push_interval: float | None = 8.0
     """Seconds (released code)."""

@@ -25,7 +25,7 @@ from agility_rl.envs.rewards import (
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, thigh_contact
 from agility_rl.motion import MotionDataset, load_clips
 from agility_rl.motion.gaits import synthetic_dataset_clips
-from agility_rl.simulation import HeightField, rough_pyramids
+from agility_rl.simulation import HeightField, ridges, rough_pyramids
 from agility_rl.training.seeding import Seeds
 
 
@@ -88,6 +88,8 @@ def make_terrain(cfg: EnvConfig, generator: torch.Generator) -> HeightField | No
     """The height field, or nothing for flat ground."""
     if cfg.terrain == "flat":
         return None
+    if cfg.terrain == "ridges":
+        return ridges(generator, slope=cfg.steepness)
     return rough_pyramids(generator, noise=cfg.roughness, slope=cfg.steepness)
 
 

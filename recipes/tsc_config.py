@@ -58,6 +58,8 @@ class PPOConfig:
     min_std: float = 0.1
     hidden: tuple[int, ...] = (512, 256, 128)
     """Supplement S6."""
+    critic_warm_up: int = 0
+    """First iterations that leave the policy as it is: a fresh critic would mislead one that copied a script."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,31 @@ class RewardConfig:
     """Table S4."""
     imitation: float = 0.2
     """Table S4, times the time step; needs the discriminator of the BBC's run."""
+    goal_velocity: float = 0.4
+    """Weight of speed towards the way-point (method notes, section 5.6)."""
+    least_speed: float = 0.0
+    """Speed up to which that is paid [m/s], where the obstacle's own (0.4 for most) is smaller (ours)."""
+    heading: float = 2.0
+    """Weight of looking at the way-point (method notes, section 5.6). Who stands and looks earns it all: with the
+    published weights 5/6 of what a robot earns that moves on, and falls."""
+    reach_goal: float = 5.0
+    """Weight of being at a way-point, for the two control steps until the next one counts (section 5.6)."""
+
+
+@dataclass(frozen=True)
+class CloningConfig:
+    iterations: int = 0
+    """Roll-outs in which the teacher copies a script before it learns by itself (ours; 0: not at all)."""
+    script: str = "trot:1.2"
+    """BEHAVIOUR:SPEED, and OBSTACLE=BEHAVIOUR:SPEED after commas, as ``evaluate_course.py --script`` takes it."""
+    scripted: float = 0.5
+    """Share of the robots that the script drives meanwhile; the teacher sees where its own choices lead with the
+    rest, and is told there too what the script would do."""
+    smoothing: float = 0.1
+    """Share of the label that is spread over all behaviours, so that PPO goes on trying each."""
+    learning_rate: float = 1e-3
+    epochs: int = 4
+    minibatches: int = 8
 
 
 @dataclass(frozen=True)
@@ -116,6 +143,7 @@ class Config:
     env: EnvConfig = field(default_factory=EnvConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
+    cloning: CloningConfig = field(default_factory=CloningConfig)
     adaptation: AdaptationConfig = field(default_factory=AdaptationConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
 
@@ -137,8 +165,11 @@ CPU = Config(
         entropy=0.005,
         continuous="selected",
         hidden=(256, 128, 64),
-        initial_std=0.5,
+        initial_std=0.3,
+        critic_warm_up=8,
     ),
+    reward=RewardConfig(task=1.0, goal_velocity=2.0, least_speed=1.2, heading=0.5, reach_goal=30.0),
+    cloning=CloningConfig(iterations=20, script="trot:1.2"),
     adaptation=AdaptationConfig(learning_rate=1e-3, minibatches=4),
 )
 SMOKE = replace(
@@ -147,8 +178,9 @@ SMOKE = replace(
     iterations=2,
     checkpoint_every=1,
     env=replace(CPU.env, num_robots=8, decision_steps=2),
-    ppo=replace(CPU.ppo, steps=4, epochs=1, minibatches=2, hidden=(32, 32)),
+    ppo=replace(CPU.ppo, steps=4, epochs=1, minibatches=2, hidden=(32, 32), critic_warm_up=1),
     adaptation=replace(CPU.adaptation, every=2, minibatches=2),
+    cloning=replace(CPU.cloning, iterations=1, epochs=1, minibatches=2),
     curriculum=replace(CPU.curriculum, episodes=1),
 )
 PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,14 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import KLAdaptiveLR
 from torchrl.objectives.value import GAE
-from tsc_config import Config, CurriculumConfig, RobotsConfig
+from tsc_config import Config, CurriculumConfig, RewardConfig, RobotsConfig
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS, skill_index
 from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.envs import COURSES, AgilityEnv, Course, load_course
 from agility_rl.envs.agility import COURSE_RANDOMIZATION
+from agility_rl.envs.agility_rewards import AGILITY_REWARDS, AgilityTerm, goal_velocity
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import features
 from agility_rl.losses import AdaptationLoss, HybridPPOLoss
@@ -138,6 +140,7 @@ def build(cfg: Config) -> Components:
         cfg.env.decision_steps,
         seed=seeds.integer("environment"),
         motion_offsets=offsets,
+        rewards=rewards(cfg.reward),
     )
     allowed = None if set(cfg.behaviours) == set(BEHAVIOURS) else sorted(skill_index(name) for name in cfg.behaviours)
     teacher = Teacher(len(OBSTACLES), ppo.hidden, ppo.initial_std, ppo.min_std, allowed)
@@ -222,6 +225,15 @@ def make_env(
         push_interval=robots.push_interval,
         **options,
     )
+
+
+def rewards(cfg: RewardConfig) -> dict[str, AgilityTerm]:
+    """The terms of the environment, weighted as the options say."""
+    terms = dict(AGILITY_REWARDS)
+    terms["goal_velocity"] = AgilityTerm(cfg.goal_velocity, partial(goal_velocity, least=cfg.least_speed))
+    for name in ("heading", "reach_goal"):
+        terms[name] = terms[name]._replace(weight=getattr(cfg, name))
+    return terms
 
 
 def frozen(controller: Controller) -> Callable[[TensorDictBase], TensorDictBase]:

@@ -23,7 +23,9 @@ from held_fixed import infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from training_run import Laps, own_options, run
+from tsc_cloning import clone
 from tsc_config import PRESETS, Config
+from tsc_script import Script
 from tsc_setup import Components, build, save_policy
 
 from agility_rl import keys
@@ -91,7 +93,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         def extra(sample: TensorDictBase) -> Tensor:
             return parts.privileged_loss(sample)["loss_privileged"] if weight > 0.0 else torch.zeros(())
 
-        metrics |= parts.ppo(batch, parts.generator, extra)
+        metrics |= parts.ppo(batch, parts.generator, extra, critic_only=iteration < cfg.ppo.critic_warm_up)
     lap("policy")
     metrics |= update_adaptation(parts, cfg.adaptation.minibatches, batch)
     lap("adaptation")
@@ -101,9 +103,12 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
 
 
 def begin(parts: Components, cfg: Config) -> None:
-    """Start from another run's teacher, if one is given."""
+    """Where a new run starts from: another run's teacher, or a copied script."""
     if cfg.init_from is not None:
         parts.teacher.load_state_dict(Artifact.load(cfg.init_from, kind="teacher").state)
+    elif cfg.cloning.iterations:
+        set_course(parts.env, parts.curriculum)
+        clone(parts, cfg.cloning)
 
 
 def train(cfg: Config) -> Path:
@@ -111,6 +116,7 @@ def train(cfg: Config) -> Path:
     cfg = own_options(cfg)
     if unknown := sorted(set(cfg.behaviours) - set(BEHAVIOURS)):
         raise ValueError(f"--behaviours: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
+    Script.parse(cfg.cloning.script, "--cloning.script")  # refused before there is a run folder
     return run(
         "tsc_teacher",
         cfg,

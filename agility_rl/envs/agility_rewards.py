@@ -30,10 +30,16 @@ class AgilityTerm(NamedTuple):
     function: Callable[[AgilityState], Tensor]
 
 
-def goal_velocity(state: AgilityState) -> Tensor:
-    """``min(v_xy . d, v_t) / (v_t + 1e-5)``: speed towards the goal, up to that of the obstacle (section 5.6)."""
+def goal_velocity(state: AgilityState, least: float = 0.0) -> Tensor:
+    """``min(v_xy . d, v_t) / (v_t + 1e-5)``: speed towards the goal, up to that of the obstacle (section 5.6).
+
+    Args:
+        state: the present.
+        least: v_t where the obstacle's is smaller [m/s] (ours): the release pays most of them up to 0.4 m/s only.
+    """
     towards = (state.velocity * state.goal_direction).sum(-1)
-    return torch.minimum(towards, state.target_speed) / (state.target_speed + 1e-5)
+    target = state.target_speed.clamp(min=least)
+    return torch.minimum(towards, target) / (target + 1e-5)
 
 
 def heading(state: AgilityState) -> Tensor:

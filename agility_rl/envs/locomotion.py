@@ -22,14 +22,17 @@ from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, Termination
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator, make_simulator
 
+EDGE = 1.0
+"""How far beyond the square of the starts an episode on a height field goes on [m]; the field ends a metre further."""
+
 
 class LocomotionEnv(EnvBase):
     """``N`` Go2 robots that move in a commanded behaviour at a commanded velocity and height.
 
     A step takes joint targets ``q* = q_default + scale * action``, holds them for one control step, and returns named
-    observation groups. Time limits are truncations; contact of trunk or hip, or divergence of the engine, terminates.
-    The reward is the task reward r^T: the sum of weighted terms times the control step, clipped at zero. Imitation,
-    skill and shift rewards are not the environment's business.
+    observation groups. Time limits and the edge of a height field are truncations; contact of trunk or hip, or
+    divergence of the engine, terminates. The reward is the task reward r^T: the sum of weighted terms times the control
+    step, clipped at zero. Imitation, skill and shift rewards are not the environment's business.
 
     Source: method notes, section 4; supplement S2, S4, Table S2.
 
@@ -194,7 +197,7 @@ class LocomotionEnv(EnvBase):
         }
         reward = torch.cat(tuple(terms.values()), -1).sum(-1, keepdim=True).clamp(min=0.0)
         terminated = torch.stack([failed(state) for failed in self.terminations]).any(0)[:, None]
-        truncated = (self._step_count >= self.max_steps)[:, None] & ~terminated
+        truncated = ((self._step_count >= self.max_steps) | self._at_edge())[:, None] & ~terminated
 
         self.commands.advance()
         self.observations.update(state)
@@ -224,6 +227,11 @@ class LocomotionEnv(EnvBase):
             joint_velocity=start["joint_velocity"],
         )
         return start.get(PAST, None)
+
+    def _at_edge(self) -> Tensor:
+        """Who has come to the edge of a height field, beyond which there is nothing to walk on."""
+        beyond = self.simulator.root_position[:, :2].abs().amax(-1) - self.simulator.ground_extent
+        return (beyond > EDGE) & (self.simulator.ground_extent > 0.0)
 
     # -- resume ------------------------------------------------------------------------------------------------------
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:  # type: ignore[override]

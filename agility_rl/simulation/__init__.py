@@ -4,7 +4,7 @@ from agility_rl.simulation.batch import BatchSimulator
 from agility_rl.simulation.depth_camera import DepthCamera
 from agility_rl.simulation.scenery import Hinge, Piece, Shape
 from agility_rl.simulation.simulator import PARAMETERS, Camera, Simulator, make_simulator
-from agility_rl.simulation.terrain import HeightField, rough_pyramids
+from agility_rl.simulation.terrain import HeightField, ridges, rough_pyramids
 
 __all__ = [
     "PARAMETERS",
@@ -17,5 +17,6 @@ __all__ = [
     "Shape",
     "Simulator",
     "make_simulator",
+    "ridges",
     "rough_pyramids",
 ]

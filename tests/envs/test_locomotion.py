@@ -13,6 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS, RESAMPLE_PERIOD
 from agility_rl.envs import LocomotionEnv
+from agility_rl.envs.locomotion import EDGE
 from agility_rl.envs.randomization import Randomization
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS
 from agility_rl.go2.constants import STANDING_HEIGHT
@@ -263,6 +264,31 @@ def test_rough_ground(build: Build) -> None:
         after = env.step(TensorDict({keys.ACTION: torch.zeros(16, 12)}, [16]))["next"]
     height = after[keys.EXPLICIT][~after["terminated"][:, 0]][:, 0]
     assert len(height) > 8 and (height - STANDING_HEIGHT).abs().max() < 0.12
+
+
+def test_who_comes_to_the_edge_of_the_ground_has_not_fallen(build: Build) -> None:
+    """Robots that are carried off a small field: their episodes are cut while there is still ground under them."""
+    field = rough_pyramids(torch.Generator().manual_seed(0), tiles=1, noise=0.0, difficulties=(0.0,))
+    env = build(64, simulator_options={"num_threads": 1, "terrain": field})
+    carrier = env.reset().set(keys.ACTION, torch.zeros(64, 12))
+    place = env.simulator.root_position.clone()
+    limit = env.simulator.ground_extent + EDGE
+    assert limit == 4.0 and field.half_size == (5.0, 5.0)
+    place[:, 0] = torch.linspace(0.0, 4.5, 64)
+    place[:, 1] = torch.linspace(-4.5, 0.0, 64)
+    env.simulator.reset(
+        torch.ones(64, dtype=torch.bool),
+        root_position=place,
+        root_quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(64, 1),
+        root_linear_velocity=torch.zeros(64, 3),
+        root_angular_velocity=torch.zeros(64, 3),
+        joint_position=env.simulator.joint_position,
+        joint_velocity=torch.zeros(64, 12),
+    )
+    after = env.step(carrier)["next"]
+    beyond = (place[:, :2].abs() > limit).any(-1)
+    assert 10 < beyond.sum() < 20
+    assert torch.equal(after["truncated"][:, 0], beyond) and not after["terminated"].any()
 
 
 def test_close_releases_the_engine(build: Build) -> None:

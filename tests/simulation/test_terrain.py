@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import mujoco
+import numpy as np
 import pytest
 import torch
 
-from agility_rl.simulation import BatchSimulator, HeightField, rough_pyramids
+from agility_rl.go2.model import ROBOT_GROUP
+from agility_rl.simulation import BatchSimulator, HeightField, ridges, rough_pyramids
 
 
 def test_height_on_grid_points_and_between() -> None:
@@ -80,3 +83,34 @@ def test_one_seed_makes_one_terrain() -> None:
 def test_degenerate_grid_is_refused() -> None:
     with pytest.raises(ValueError, match="rows >= 2"):
         HeightField(torch.zeros(1, 5), (1.0, 1.0))
+
+
+def test_ridges_are_planes_of_the_given_slopes(generator: torch.Generator) -> None:
+    field = ridges(generator, slope=0.2, spacing=3.0, half_size=30.0)
+    assert field.half_size == (30.0, 30.0) and field.heights.shape == (21, 21)
+    assert torch.equal(field.heights, field.heights[:1].expand(21, -1))  # they run along y
+    slopes = (field.heights[0].diff() / 3.0).round(decimals=6).unique()
+    torch.testing.assert_close(slopes, torch.tensor([-0.2, -0.1, 0.0, 0.1, 0.2]))
+    x = torch.linspace(-29.9, 29.9, 997)
+    heights = field.height_at(torch.stack((x, 7.0 * x.sin()), -1))
+    expected = np.interp(x.numpy(), np.arange(21) * 3.0 - 30.0, field.heights[0].numpy())
+    np.testing.assert_allclose(heights.numpy(), expected, atol=1e-5)
+    with pytest.raises(ValueError, match=r"narrower than the field, got 9.0 m of 4.0 m"):
+        ridges(generator, spacing=9.0, half_size=2.0)
+
+
+def test_a_robot_on_a_ridge_stands_where_the_field_says(generator: torch.Generator) -> None:
+    """Rays find the engine's ground at the heights that the field reports."""
+    field = ridges(generator, slope=0.25, half_size=9.0)
+    simulator = BatchSimulator(1, num_threads=1, terrain=field)
+    data = mujoco.MjData(simulator.model)
+    mujoco.mj_forward(simulator.model, data)
+    ground = np.ones(6, dtype=np.uint8)
+    ground[ROBOT_GROUP] = 0
+    for x, y in ((-7.3, 2.0), (-1.1, -4.2), (0.4, 5.5), (6.6, -8.0)):
+        geom = np.zeros(1, dtype=np.int32)
+        distance = mujoco.mj_ray(
+            simulator.model, data, np.array([x, y, 5.0]), np.array([0.0, 0.0, -1.0]), ground, 1, -1, geom, None
+        )
+        expected = field.height_at(torch.tensor([x, y])).item()
+        assert 5.0 - distance == pytest.approx(expected, abs=1e-4)

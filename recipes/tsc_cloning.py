@@ -1,0 +1,78 @@
+"""A teacher that copies a script before it learns by itself, as a dog is led over a course before it runs alone.
+
+Behaviours that are drawn anew for every decision are none: who is told to jump for a tenth of a second does not jump.
+To find by chance that a bar is to be jumped takes longer than two cores have time for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.nn import functional as F
+from tsc_config import CloningConfig
+from tsc_script import Script
+from tsc_setup import Components
+
+from agility_rl import keys
+
+READ = (keys.OBSTACLE, keys.HEADING_ERROR)
+"""What a script reads."""
+
+
+def clone(parts: Components, cfg: CloningConfig) -> dict[str, float]:
+    """Copy a script in several roll-outs; returns the losses of the last minibatch.
+
+    Source: ours; robots that the teacher drives are labelled too, as in DAgger (Ross et al. 2011, arXiv:1011.0686).
+
+    Raises:
+        ValueError: if the script is none.
+    """
+    script = Script.parse(cfg.script, "--cloning.script")
+    actor = parts.teacher.trained_actor()
+    networks = actor[:-1]  # up to the distribution
+    optimizer = torch.optim.Adam(actor.parameters(), lr=cfg.learning_rate, fused=True)
+    policy = led(parts, script, round(cfg.scripted * parts.env.num_robots))
+    losses: dict[str, Tensor] = {}
+    for _ in range(cfg.iterations):
+        batch = parts.rollout.collect(policy).select(*actor.in_keys, *READ).flatten()
+        label = script.decide(batch.select(*READ))[keys.ACTION]
+        for _ in range(cfg.epochs):
+            for rows in torch.randperm(len(batch), generator=parts.generator).chunk(cfg.minibatches):
+                losses = imitation(networks(batch[rows]), label[rows], cfg.smoothing)
+                optimizer.zero_grad(set_to_none=True)
+                torch.stack(tuple(losses.values())).sum().backward()
+                optimizer.step()
+    return {name: value.item() for name, value in losses.items()}
+
+
+def imitation(said: TensorDictBase, label: TensorDictBase, smoothing: float) -> dict[str, Tensor]:
+    """Cross-entropy of the behaviours, and squared error of all their parameters.
+
+    Example:
+        >>> said = TensorDict({"logits": torch.zeros(1, 5), "loc": torch.zeros(1, 5, 6)}, [1])
+        >>> label = TensorDict({"behaviour": torch.tensor([2]), "parameters": torch.ones(1, 5, 6)}, [1])
+        >>> {name: round(float(loss), 4) for name, loss in imitation(said, label, 0.0).items()}
+        {'behaviour': 1.6094, 'parameters': 1.0}
+    """
+    return {
+        "behaviour": F.cross_entropy(said["logits"], label[keys.BEHAVIOUR], label_smoothing=smoothing),
+        "parameters": F.mse_loss(said["loc"], label[keys.PARAMETERS]),
+    }
+
+
+def led(parts: Components, script: Script, number: int) -> Callable[[TensorDictBase], TensorDictBase]:
+    """The teacher as a policy in whose place a script drives the first robots."""
+    own = parts.teacher.privileged_policy()
+
+    def act(td: TensorDictBase) -> TensorDictBase:
+        td = own(td)
+        if number:
+            told = script.decide(TensorDict({key: td[key][:number] for key in READ}, [number]))[keys.ACTION]
+            for key in (keys.BEHAVIOUR, keys.PARAMETERS):
+                td[keys.ACTION, key][:number] = told[key]
+        return td
+
+    return act

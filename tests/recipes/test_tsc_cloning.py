@@ -1,0 +1,69 @@
+"""Copying a script: the losses by hand, who drives, and that a teacher does as the script when it has copied it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from agility_rl import keys
+from agility_rl.behaviours import skill_index
+
+Module = Callable[[str], ModuleType]
+
+
+@pytest.fixture
+def smoke(module: Module, untrained: Path, tmp_path: Path) -> Any:
+    cfg = module("tsc_config").PRESETS["smoke"]
+    env = replace(cfg.env, num_threads=1)
+    return replace(cfg, runs=tmp_path, bbc=untrained, env=env, reward=replace(cfg.reward, imitation=0.0))
+
+
+def test_losses_by_hand(module: Module) -> None:
+    said = TensorDict({"logits": torch.tensor([[0.0, math.log(3.0)]]), "loc": torch.zeros(1, 2, 1)}, [1])
+    label = TensorDict({keys.BEHAVIOUR: torch.tensor([1]), keys.PARAMETERS: torch.tensor([[[2.0], [1.0]]])}, [1])
+    losses = module("tsc_cloning").imitation(said, label, 0.2)
+    # choices of 1/4 and 3/4, labels of 0.1 and 0.9
+    assert losses["behaviour"].item() == pytest.approx(0.1 * math.log(4.0) + 0.9 * math.log(4.0 / 3.0))
+    assert losses["parameters"].item() == pytest.approx((4.0 + 1.0) / 2.0)
+
+
+def test_the_script_drives_its_share(module: Module, smoke: Any) -> None:
+    cloning, parts = module("tsc_cloning"), module("tsc_setup").build(smoke)
+    script = module("tsc_script").Script.parse("jump:1.5")
+    td = cloning.led(parts, script, 3)(parts.env.reset())
+    told = script.decide(td.select(*cloning.READ))[keys.ACTION]
+    chosen = td[keys.ACTION]
+    assert torch.equal(chosen[keys.BEHAVIOUR][:3], told[keys.BEHAVIOUR][:3])
+    assert torch.equal(chosen[keys.PARAMETERS][:3], told[keys.PARAMETERS][:3])
+    assert (chosen[keys.PARAMETERS][3:] != told[keys.PARAMETERS][3:]).all()
+    parts.env.close()
+
+
+def test_a_teacher_does_what_it_has_copied(module: Module, smoke: Any) -> None:
+    parts = module("tsc_setup").build(replace(smoke, env=replace(smoke.env, num_robots=32)))
+    own = replace(smoke.cloning, script="trot:1.4,tunnel=walk:0.4", iterations=10, epochs=20, learning_rate=3e-3)
+    losses = module("tsc_cloning").clone(parts, own)
+    assert losses["parameters"] < 0.05
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        td = parts.teacher.privileged_policy()(parts.env.reset())
+    expected = module("tsc_script").Script.parse(own.script).decide(td.clone())[keys.ACTION]
+    assert torch.equal(td[keys.ACTION, keys.BEHAVIOUR], expected[keys.BEHAVIOUR])
+    speed = td[keys.ACTION, keys.PARAMETERS][td[keys.ACTION, keys.BEHAVIOUR] == skill_index("trot")][:, 2, 0]
+    torch.testing.assert_close(speed, torch.full_like(speed, 0.8), atol=0.2, rtol=0.0)  # 1.4 m/s of 0.5 to 1.5
+    parts.env.close()
+
+
+def test_a_bad_script_is_refused_before_anything_is_trained(module: Module, smoke: Any) -> None:
+    cfg = replace(smoke, cloning=replace(smoke.cloning, script="gallop:1.0"))
+    with pytest.raises(ValueError, match=r"--cloning.script: expected BEHAVIOUR:SPEED"):
+        module("tsc_teacher").train(cfg)
+    assert not (cfg.runs / cfg.name).exists()
