@@ -23,7 +23,7 @@ from bbc_cloning import clone_behaviour
 from bbc_config import Config, ImitationConfig, at, check_changes
 from bbc_presets import PRESETS
 from bbc_setup import ANCHORED, Components, build, save_policy
-from held_fixed import infer
+from held_fixed import fit, infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from training_run import Laps, own_options, run
@@ -167,20 +167,6 @@ def distance_to_anchor(parts: Components, sample: TensorDictBase, turn_rate: flo
     return error.mean()
 
 
-def update_adaptation(parts: Components, minibatches: int, batch: TensorDictBase) -> dict[str, Tensor]:
-    """Fit the state estimator and the history encoder, which stand in for what the robot cannot measure (S6)."""
-    flat = batch.select(keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.HISTORY).flatten()
-    totals: dict[str, Tensor] = {}
-    for rows in torch.randperm(flat.numel(), generator=parts.generator).chunk(minibatches):
-        sample = flat[rows]
-        totals = dict(parts.estimation_loss(sample).items()) | dict(parts.adaptation_loss(sample).items())
-        loss = totals["loss_estimation"] + totals["loss_adaptation"]
-        parts.adaptation_optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        parts.adaptation_optimizer.step()
-    return {name: value.detach() for name, value in totals.items() if value.numel() == 1}
-
-
 def begin(parts: Components, cfg: Config) -> None:
     """Where a new run starts from: labels for Q^c, and another run's policy or the labelled clips."""
     warm_up_predictor(parts, cfg.imitation)
@@ -258,7 +244,8 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
 
         metrics |= parts.ppo(batch, parts.generator, extra, critic_only=iteration < cfg.ppo.critic_warm_up)
     lap("policy")
-    metrics |= update_adaptation(parts, cfg.adaptation.minibatches, batch)
+    stand_ins = (parts.estimation_loss, parts.adaptation_loss)
+    metrics |= fit(stand_ins, parts.adaptation_optimizer, batch, cfg.adaptation.minibatches, parts.generator)
     lap("adaptation")
     metrics |= {f"task/{name}": value.mean() for name, value in batch["next", keys.REWARD_TERMS].items()}
     metrics |= {f"prior/{name}": p for name, p in zip(BEHAVIOURS, parts.prior.probabilities, strict=True)}

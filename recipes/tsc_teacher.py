@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 from course_metrics import judge, set_course
-from held_fixed import infer
+from held_fixed import fit, infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from training_run import Laps, own_options, run
@@ -60,18 +60,6 @@ def add_rewards(parts: Components, cfg: Config, batch: TensorDictBase) -> dict[s
     return {f"reward/{name}": value.mean() for name, value in rewards.items()}
 
 
-def update_adaptation(parts: Components, minibatches: int, batch: TensorDictBase) -> dict[str, Tensor]:
-    """Fit the history encoder, which stands in for the privileged one (S6)."""
-    flat = batch.select(keys.PRIVILEGED, keys.HISTORY).flatten()
-    totals: dict[str, Tensor] = {}
-    for rows in torch.randperm(flat.numel(), generator=parts.generator).chunk(minibatches):
-        totals = dict(parts.adaptation_loss(flat[rows]).items())
-        parts.adaptation_optimizer.zero_grad(set_to_none=True)
-        totals["loss_adaptation"].backward()
-        parts.adaptation_optimizer.step()
-    return {name: value.detach() for name, value in totals.items() if value.numel() == 1}
-
-
 def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     """One iteration of Algorithm S3's first loop; returns metrics by name."""
     lap = Laps()
@@ -95,7 +83,8 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
 
         metrics |= parts.ppo(batch, parts.generator, extra, critic_only=iteration < cfg.ppo.critic_warm_up)
     lap("policy")
-    metrics |= update_adaptation(parts, cfg.adaptation.minibatches, batch)
+    optimizer, minibatches = parts.adaptation_optimizer, cfg.adaptation.minibatches
+    metrics |= fit((parts.adaptation_loss,), optimizer, batch, minibatches, parts.generator)
     lap("adaptation")
     metrics |= {f"task/{name}": value.mean() for name, value in batch["next", keys.REWARD_TERMS].items()}
     metrics["std"] = parts.teacher.actor.network.parameters_head.std.detach().mean()
