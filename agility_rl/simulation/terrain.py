@@ -115,13 +115,13 @@ def ridges(
     generator: torch.Generator,
     *,
     slope: float = 0.25,
-    spacing: float = 3.0,
+    spacing: float = 1.5,
     half_size: float = 20.0,
 ) -> HeightField:
     """Ridges and valleys along y: strips that rise, fall or stay level, a few metres wide.
 
-    Source: ours; the ramps of the course have slopes of 0.23 (A-frame). Cells as large as the strips have few edges
-    for a foot to be caught on, and are planes, so that the heights between are exact.
+    Source: ours; the ramps of the A-frame are 1.46 m long with a slope of 0.23. Cells as large as the strips have few
+    edges for a foot to be caught on, and are planes, so that the heights between are exact.
 
     Args:
         generator: source of randomness.
@@ -135,7 +135,7 @@ def ridges(
     Example:
         >>> field = ridges(torch.Generator().manual_seed(0), slope=0.2, half_size=6.0)
         >>> field.heights.shape, field.half_size
-        (torch.Size([5, 5]), (6.0, 6.0))
+        (torch.Size([9, 9]), (6.0, 6.0))
     """
     strips = round(2.0 * half_size / spacing)
     if strips < 1:
