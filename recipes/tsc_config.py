@@ -127,7 +127,7 @@ class Config:
     """Folder under ``runs``."""
     runs: Path = Path("runs")
     seed: int = 0
-    bbc: Path = Path("pretrained/bbc_turning")
+    bbc: Path = Path("pretrained/bbc_course")
     """Run or artifact folder of the Basic Behaviour Controller."""
     iterations: int = 30_000
     """Released code (method notes, section 5.9)."""

@@ -2,7 +2,7 @@
 
 Source: Fu et al. 2025, supplement S2, S5, S6, Algorithm S3, Table S4; method notes, section 5.
 
-In:  a Basic Behaviour Controller (``--bbc RUN``; the pretrained one that turns by default), which stays as it is.
+In:  a Basic Behaviour Controller (``--bbc RUN``; the pretrained one for courses by default), which stays as it is.
 Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap``, ``checkpoints/``, ``policy/``.
 
     python recipes/tsc_teacher.py cpu --name my_teacher
