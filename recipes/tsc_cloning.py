@@ -33,6 +33,7 @@ def clone(parts: Components, cfg: CloningConfig) -> dict[str, float]:
     script = Script.parse(cfg.script, "--cloning.script")
     actor = parts.teacher.trained_actor()
     networks = actor[:-1]  # up to the distribution
+    allowed = parts.teacher.actor.network.mask == 0.0
     optimizer = torch.optim.Adam(actor.parameters(), lr=cfg.learning_rate, fused=True)
     policy = led(parts, script, round(cfg.scripted * parts.env.num_robots))
     losses: dict[str, Tensor] = {}
@@ -41,24 +42,32 @@ def clone(parts: Components, cfg: CloningConfig) -> dict[str, float]:
         label = script.decide(batch.select(*READ))[keys.ACTION]
         for _ in range(cfg.epochs):
             for rows in torch.randperm(len(batch), generator=parts.generator).chunk(cfg.minibatches):
-                losses = imitation(networks(batch[rows]), label[rows], cfg.smoothing)
+                losses = imitation(networks(batch[rows]), label[rows], cfg.smoothing, allowed)
                 optimizer.zero_grad(set_to_none=True)
                 torch.stack(tuple(losses.values())).sum().backward()
                 optimizer.step()
     return {name: value.item() for name, value in losses.items()}
 
 
-def imitation(said: TensorDictBase, label: TensorDictBase, smoothing: float) -> dict[str, Tensor]:
+def imitation(said: TensorDictBase, label: TensorDictBase, smoothing: float, allowed: Tensor) -> dict[str, Tensor]:
     """Cross-entropy of the behaviours, and squared error of all their parameters.
+
+    Args:
+        said: ``logits`` [M, 5] and ``loc`` [M, 5, 6] of the teacher.
+        label: ``behaviour`` int64 [M] and ``parameters`` [M, 5, 6] of the script.
+        smoothing: share of the label that is spread over the allowed behaviours.
+        allowed: bool [5].
 
     Example:
         >>> said = TensorDict({"logits": torch.zeros(1, 5), "loc": torch.zeros(1, 5, 6)}, [1])
         >>> label = TensorDict({"behaviour": torch.tensor([2]), "parameters": torch.ones(1, 5, 6)}, [1])
-        >>> {name: round(float(loss), 4) for name, loss in imitation(said, label, 0.0).items()}
+        >>> losses = imitation(said, label, 0.0, torch.ones(5, dtype=torch.bool))
+        >>> {name: round(float(loss), 4) for name, loss in losses.items()}
         {'behaviour': 1.6094, 'parameters': 1.0}
     """
+    wanted = F.one_hot(label[keys.BEHAVIOUR], len(allowed)) * (1.0 - smoothing) + smoothing * allowed / allowed.sum()
     return {
-        "behaviour": F.cross_entropy(said["logits"], label[keys.BEHAVIOUR], label_smoothing=smoothing),
+        "behaviour": F.cross_entropy(said["logits"], wanted),
         "parameters": F.mse_loss(said["loc"], label[keys.PARAMETERS]),
     }
 

@@ -105,7 +105,13 @@ def train(cfg: Config) -> Path:
     cfg = own_options(cfg)
     if unknown := sorted(set(cfg.behaviours) - set(BEHAVIOURS)):
         raise ValueError(f"--behaviours: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
-    Script.parse(cfg.cloning.script, "--cloning.script")  # refused before there is a run folder
+    script = Script.parse(cfg.cloning.script, "--cloning.script")
+    copies = cfg.cloning.iterations > 0 and cfg.init_from is None
+    if copies and (forbidden := sorted(set(script.behaviours) - set(cfg.behaviours))):
+        raise ValueError(
+            f"--cloning.script {cfg.cloning.script} chooses {', '.join(forbidden)}, which --behaviours leaves out; "
+            "give another script, or --cloning.iterations 0"
+        )
     return run(
         "tsc_teacher",
         cfg,

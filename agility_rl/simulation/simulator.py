@@ -60,7 +60,8 @@ class Simulator(Protocol):
         num_simulations: N.
         control_dt: seconds of one :meth:`step`.
         sim_dt: seconds of one physics step.
-        ground_extent: half side of the square in which robots may start [m]; 0 on the plane.
+        ground_extent: half side of the square in which robots may start [m], which a height field reaches beyond by at
+            least 2 m; 0 on the plane.
         root_position: ``[N, 3]`` [m], world frame.
         root_quaternion: ``[N, 4]`` (w, x, y, z).
         root_linear_velocity: ``[N, 3]`` [m/s], world frame.

@@ -118,7 +118,7 @@ def ridges(
     spacing: float = 1.5,
     half_size: float = 20.0,
 ) -> HeightField:
-    """Ridges and valleys along y: strips that rise, fall or stay level, a few metres wide.
+    """Ridges and valleys along y: strips that rise, fall or stay level, one and a half metres wide.
 
     Source: ours; the ramps of the A-frame are 1.46 m long with a slope of 0.23. Cells as large as the strips have few
     edges for a foot to be caught on, and are planes, so that the heights between are exact.

@@ -16,6 +16,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from agility_rl import keys
 from agility_rl.behaviours import skill_index
+from agility_rl.deploy.artifact import Artifact
+from agility_rl.modules.hybrid_actor import FORBIDDEN
 
 Module = Callable[[str], ModuleType]
 
@@ -28,12 +30,14 @@ def smoke(module: Module, untrained: Path, tmp_path: Path) -> Any:
 
 
 def test_losses_by_hand(module: Module) -> None:
-    said = TensorDict({"logits": torch.tensor([[0.0, math.log(3.0)]]), "loc": torch.zeros(1, 2, 1)}, [1])
-    label = TensorDict({keys.BEHAVIOUR: torch.tensor([1]), keys.PARAMETERS: torch.tensor([[[2.0], [1.0]]])}, [1])
-    losses = module("tsc_cloning").imitation(said, label, 0.2)
-    # choices of 1/4 and 3/4, labels of 0.1 and 0.9
+    logits = torch.tensor([[0.0, math.log(3.0), FORBIDDEN]])
+    said = TensorDict({"logits": logits, "loc": torch.zeros(1, 3, 1)}, [1])
+    parameters = torch.tensor([[[2.0], [1.0], [2.0]]])
+    label = TensorDict({keys.BEHAVIOUR: torch.tensor([1]), keys.PARAMETERS: parameters}, [1])
+    losses = module("tsc_cloning").imitation(said, label, 0.2, torch.tensor([True, True, False]))
+    # choices of 1/4 and 3/4, labels of 0.1 and 0.9; what is not allowed has no share of either
     assert losses["behaviour"].item() == pytest.approx(0.1 * math.log(4.0) + 0.9 * math.log(4.0 / 3.0))
-    assert losses["parameters"].item() == pytest.approx((4.0 + 1.0) / 2.0)
+    assert losses["parameters"].item() == pytest.approx((4.0 + 1.0 + 4.0) / 3.0)
 
 
 def test_the_script_drives_its_share(module: Module, smoke: Any) -> None:
@@ -67,3 +71,11 @@ def test_a_bad_script_is_refused_before_anything_is_trained(module: Module, smok
     with pytest.raises(ValueError, match=r"--cloning.script: expected BEHAVIOUR:SPEED"):
         module("tsc_teacher").train(cfg)
     assert not (cfg.runs / cfg.name).exists()
+
+
+def test_a_script_may_only_choose_what_the_teacher_may(module: Module, smoke: Any) -> None:
+    recipe, only = module("tsc_teacher"), replace(smoke, behaviours=("canter",))
+    with pytest.raises(ValueError, match=r"--cloning.script trot:1.2 chooses trot, which --behaviours leaves out"):
+        recipe.train(only)
+    run = recipe.train(replace(only, iterations=1, cloning=replace(smoke.cloning, script="canter:1.2")))
+    assert Artifact.load(run / "policy").manifest["network"]["allowed"] == [skill_index("canter")]
