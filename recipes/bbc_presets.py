@@ -50,6 +50,7 @@ CPU = Config(
         desired_kl=0.02,
         gamma=0.98,
         entropy=0.002,
+        precision="auto",
         initial_std=0.5,
         hidden=(256, 128, 64),
         critic_history=False,

@@ -34,6 +34,7 @@ from agility_rl.modules import (
 from agility_rl.motion import MotionDataset
 from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.ppo import PPOUpdate
+from agility_rl.training.precision import hidden_precision
 from agility_rl.training.rollout import Rollout
 from agility_rl.training.seeding import Seeds, seed_everything
 
@@ -180,6 +181,7 @@ def build(cfg: Config) -> Components:
             keep=["loc", "scale", INFERRED, ANCHORED],
             divergence=divergence,
             schedule=schedule,
+            precision=hidden_precision(ppo.precision),
         ),
         discriminator_loss=DiscriminatorLoss(
             discriminator, criterion=im.criterion, gradient_penalty=im.gradient_penalty

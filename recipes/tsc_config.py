@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from agility_rl.training.precision import Precision
+
 
 @dataclass(frozen=True)
 class RobotsConfig:
@@ -54,6 +56,8 @@ class PPOConfig:
     """Of both parts (method notes, section 5.2)."""
     value: float = 1.0
     max_grad_norm: float = 1.0
+    precision: Precision = "float32"
+    """Of the hidden layers in the update; ``auto`` is bfloat16 on a CPU that multiplies in it, about twice as fast."""
     initial_std: float = 1.0
     min_std: float = 0.1
     hidden: tuple[int, ...] = (512, 256, 128)
@@ -165,6 +169,7 @@ CPU = Config(
         entropy=0.005,
         continuous="selected",
         hidden=(256, 128, 64),
+        precision="auto",
         initial_std=0.3,
         critic_warm_up=8,
     ),

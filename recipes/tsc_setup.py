@@ -30,6 +30,7 @@ from agility_rl.losses import AdaptationLoss, HybridPPOLoss
 from agility_rl.modules import Critic, Discriminator, FeatureNormalizer, Teacher
 from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.ppo import PPOUpdate
+from agility_rl.training.precision import hidden_precision
 from agility_rl.training.rollout import Rollout
 from agility_rl.training.seeding import Seeds, seed_everything
 
@@ -204,6 +205,7 @@ def build(cfg: Config) -> Components:
             keep=["logits", "loc", "scale", INFERRED],
             divergence=divergence,
             schedule=schedule,
+            precision=hidden_precision(ppo.precision),
         ),
         bbc=controller,
     )

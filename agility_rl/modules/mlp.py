@@ -47,12 +47,31 @@ def mlp(
         )
     layers: list[nn.Module] = []
     for index, (size_in, size_out) in enumerate(itertools.pairwise(sizes)):
-        linear = nn.Linear(size_in, size_out)
+        linear = (nn.Linear if index < len(hidden) else OutputLinear)(size_in, size_out)
         nn.init.zeros_(linear.bias)
         layers.append(linear)
         if index < len(hidden):
             layers.append(activation())
     return nn.Sequential(*layers)
+
+
+class OutputLinear(nn.Linear):
+    """A linear layer that computes in float32 inside ``torch.autocast`` too.
+
+    A mean, value or logit rounded to bfloat16's 8 bits blurs what is made of it: distributions, ratios, advantages.
+
+    Example:
+        >>> with torch.autocast("cpu", torch.bfloat16):
+        ...     nn.Linear(3, 2)(torch.zeros(1, 3)).dtype, OutputLinear(3, 2)(torch.zeros(1, 3)).dtype
+        (torch.bfloat16, torch.float32)
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """``[*B, out_features]``, float32."""
+        if not torch.is_autocast_enabled(input.device.type):
+            return super().forward(input)
+        with torch.autocast(input.device.type, enabled=False):
+            return super().forward(input.float())
 
 
 class ConcatenatedMLP(nn.Module):

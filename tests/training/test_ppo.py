@@ -85,3 +85,29 @@ def test_a_warm_up_of_the_critic_leaves_the_policy_alone() -> None:
     ]
     assert same == [True, False]
     assert metrics["learning_rate"].item() == pytest.approx(3e-3)
+
+
+def test_hidden_layers_in_bfloat16_leave_the_rest_in_float32_and_learn_the_same() -> None:
+    ends = {}
+    for precision in (torch.float32, torch.bfloat16):
+        actor, critic, update = build(precision=precision)
+        generator = torch.Generator().manual_seed(1)
+        for _ in range(40):
+            metrics = update(collect(actor, critic, generator), generator)
+        assert all(value.dtype is torch.float32 for value in (*metrics.values(), *actor.parameters()))
+        ends[precision] = collect(actor, critic, torch.Generator().manual_seed(2))["value_target"].mean().item()
+
+        layers = actor.network.mean.layers
+        formats = {name: formats_of(layers[index]) for name, index in (("hidden", 0), ("mean", -1))}
+        batch = collect(actor, critic, generator)
+        assert formats == {"hidden": {torch.float32}, "mean": {torch.float32}}  # roll-outs are not in it
+        update(batch, generator)
+        assert formats == {"hidden": {torch.float32, precision}, "mean": {torch.float32}}
+    assert ends[torch.bfloat16] == pytest.approx(ends[torch.float32], rel=0.15)
+
+
+def formats_of(layer: torch.nn.Module) -> set[torch.dtype]:
+    """Number formats of what a layer puts out, from now on."""
+    seen: set[torch.dtype] = set()
+    layer.register_forward_hook(lambda module, args, out: seen.add(out.dtype))
+    return seen
