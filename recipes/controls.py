@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agility_rl.deploy import BehaviourCommand, Operator
 from agility_rl.deploy.browser import LOOPBACK, BrowserDevice, exposure
-from agility_rl.deploy.commander import Commander
 from agility_rl.deploy.controller import StepRecord
 from agility_rl.deploy.gamepad import GamepadDevice
 from agility_rl.deploy.operator import Device, Operation, Status, Stick
@@ -70,11 +68,6 @@ class ByHand:
     def finished(self) -> bool:
         """Whether the device has gone and the robot lies."""
         return self.operation.device.ended()
-
-
-def task_policy(now: float) -> Commander:
-    """Who decides where the operator does not; without a task policy nobody does, and the robot stands."""
-    return Operator(BehaviourCommand.of("walk", velocity_x=0.0), now)
 
 
 def make_device(

@@ -3,7 +3,7 @@
 The robot stands up, moves in the behaviour that is asked for, stops, and sinks down; or a person drives it, from a
 browser, a terminal or with a gamepad. Ctrl-C stops it at once, as every fault does.
 
-In:  an artifact folder (or a run), best after recipes/export.py.
+In:  an artifact folder (or a run), best after recipes/export.py; and a student's, which then decides what to do.
 Out: one MCAP file that opens in Foxglove and rerun, and is a robot log for recipes/easi.py.
 
     python recipes/deploy.py pretrained/bbc --transport mujoco --seconds 20 --skill trot --speed 1.0
@@ -11,6 +11,7 @@ Out: one MCAP file that opens in Foxglove and rerun, and is a robot log for reci
     python recipes/deploy.py exported/bbc --transport dds --interface eth0     # a real one: docs/deployment.md first
     python recipes/deploy.py pretrained/bbc --transport lcm                    # a simulated robot, over LCM
     python recipes/deploy.py pretrained/bbc --operator terminal                # drive it by hand
+    python recipes/deploy.py pretrained/bbc_course --task runs/my_student --course full
 
 Status: 0 if all went well, 1 if a fault ended the run or it never began.
 """
@@ -24,22 +25,29 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import torch
 import tyro
-from controls import ByHand, ControlsConfig, make_device, task_policy
+from controls import ByHand, ControlsConfig, make_device
 from robot_line import RobotConfig, connect
+from run_record import Recorder
+from task_policy import TaskConfig, load_camera, standing
 
-from agility_rl import rotations
-from agility_rl.behaviours import COMMANDS
-from agility_rl.collectors.log_formats import AXES
-from agility_rl.deploy import Artifact, BehaviourCommand, Controller, DeployedBBC, Mode, Operator, SafetyLimits
+from agility_rl.deploy import (
+    Artifact,
+    BehaviourCommand,
+    Controller,
+    DeployedBBC,
+    DeployedStudent,
+    Mode,
+    SafetyLimits,
+)
 from agility_rl.deploy.behaviour import onnx_network, torch_network
 from agility_rl.deploy.controller import StepRecord
 from agility_rl.deploy.deadlines import Clock, Durations, MonotonicClock
+from agility_rl.deploy.depth import DepthSource
 from agility_rl.deploy.operator import Operation, SharedControl
-from agility_rl.go2 import constants, features
 from agility_rl.go2.appearance import dress
 from agility_rl.go2.model import build_spec
 from agility_rl.record import EpisodeRecorder
@@ -56,7 +64,7 @@ READY_SECONDS = 0.5
 
 
 @dataclass(frozen=True)
-class Config(RobotConfig, ControlsConfig):
+class Config(RobotConfig, ControlsConfig, TaskConfig):
     artifact: Annotated[Path, tyro.conf.Positional]
     """Artifact folder of a BBC, or a run with one."""
     operator: Literal["script", "browser", "terminal", "gamepad"] = "script"
@@ -64,7 +72,7 @@ class Config(RobotConfig, ControlsConfig):
     seconds: float = 20.0
     """With a script: time in the behaviour, without standing up and sinking down."""
     skill: str = "trot"
-    """With a script: walk, pace, trot, canter or jump."""
+    """With a script and without a student: walk, pace, trot, canter or jump."""
     speed: float | None = None
     """Forward velocity [m/s], kept inside the behaviour's range (Table S2); its middle by default."""
     yaw_rate: float = 0.0
@@ -81,67 +89,17 @@ class Config(RobotConfig, ControlsConfig):
     """Missed control steps in a row that end the run."""
     operator_age: float = 0.5
     """Time without a word of the operator that ends the run [s]."""
-
-
-class Recorder:
-    """Writes every control step: for eyes, and in the form of a robot log.
-
-    Rows into which no transition of the behaviour controller leads have ``start`` 1: standing up, damping, and steps
-    after a missed one.
-    """
-
-    def __init__(self, episode: EpisodeRecorder, bbc: DeployedBBC) -> None:
-        self.episode, self.bbc = episode, bbc
-        self._begun: float | None = None
-
-    def __call__(self, step: StepRecord) -> None:
-        """Write one control step, once the robot has spoken."""
-        state = step.state
-        if state is None:
-            return
-        self._begun = step.time if self._begun is None else self._begun
-        action = step.action
-        if action is None:
-            driven = step.command.stiffness > 0
-            action = torch.where(driven, (step.command.position - self.bbc.default_pose) / self.bbc.action_scale, 0.0)
-        height = float(step.estimate[0]) if step.estimate is not None else 0.0
-        position = torch.tensor([0.0, 0.0, height]) if state.trunk_position is None else state.trunk_position
-        roll, pitch, _ = rotations.to_euler(state.quaternion)
-        command = torch.zeros(len(COMMANDS)) if step.behaviour is None else step.behaviour.command
-        self.episode.record(
-            position,
-            state.quaternion,
-            state.joint_position,
-            joint_velocity=state.joint_velocity,
-            joint_torque=state.joint_torque,
-            foot_contact=state.foot_force > features.FOOT_CONTACT_FORCE,
-            signals={
-                "roll_pitch": {"roll": float(roll), "pitch": float(pitch)},
-                "angular_velocity": dict(zip(AXES, state.angular_velocity.tolist(), strict=True)),
-                "linear_acceleration": dict(zip(AXES, state.linear_acceleration.tolist(), strict=True)),
-                "action": dict(zip(constants.JOINT_NAMES, action.tolist(), strict=True)),
-                "start": {"value": float(not step.continues)},
-                "command": dict(zip(COMMANDS, command.tolist(), strict=True)),
-                "controller": {
-                    "mode": str(step.mode),
-                    "behaviour": "" if step.behaviour is None else step.behaviour.name,
-                    "estimated_height": height,
-                },
-                "foot_force": dict(zip(constants.LEGS, state.foot_force.tolist(), strict=True)),
-                "timing": {
-                    "time": step.time - self._begun,
-                    "state_age": step.time - state.time,
-                    "lateness": step.lateness,
-                    "duration": step.duration,
-                },
-            },
-        )
+    camera: str | None = None
+    """With a student: MODULE:NAME that makes the depth camera (agility_rl.deploy.depth.DepthSource); a robot simulated
+    with --transport mujoco has one."""
+    depth_age: float = 0.2
+    """Oldest depth image that ends the run [s]: ten at 50 Hz."""
 
 
 class Procedure:
     """Asks for one mode after the other: stand up, run for some time, stop, sink down."""
 
-    def __init__(self, controller: Controller, operator: Operator, seconds: float) -> None:
+    def __init__(self, controller: Controller, operator: SharedControl, seconds: float) -> None:
         self.controller, self.operator, self.seconds = controller, operator, seconds
         self.finished = False
         self._since: tuple[Mode, float] | None = None
@@ -214,6 +172,12 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
     if path.suffix != ".mcap" or path.exists():
         raise ValueError(f"expected --output to be a new file that ends in .mcap, got {path}")
     cfg.check()
+    if cfg.task is not None and cfg.camera is None and cfg.transport != "mujoco":
+        raise ValueError(
+            "a student looks by a camera: the simulated robot of --transport mujoco has one, for any other give "
+            "--camera MODULE:NAME (docs/deployment.md)"
+        )
+    own_camera = load_camera(cfg.camera) if cfg.camera else None
     robot_options = {} if cfg.real else cfg.options(artifact.manifest)
     metadata = {
         "weights": artifact.manifest["weights"]["sha256"],
@@ -223,7 +187,7 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
     limits = SafetyLimits.from_manifest(
         artifact.manifest,
         state_age=cfg.state_age,
-        source_age={"operator": cfg.operator_age},
+        source_age={"operator": cfg.operator_age, "depth": cfg.depth_age},
         missed_deadlines=cfg.missed_deadlines,
     )
     with contextlib.ExitStack() as stack:
@@ -231,18 +195,20 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
         if cfg.operator != "script":
             device = make_device(cfg.operator, cfg, lambda: dress(build_spec()).compile())
             stack.callback(device.close)
-        transport, robot = stack.enter_context(connect(cfg, robot_options))
+        simulated_camera = cfg.task is not None and own_camera is None
+        transport, robot = stack.enter_context(connect(cfg, robot_options, simulated_camera))
         episode = stack.enter_context(EpisodeRecorder(path, dt=bbc.period, metadata=metadata))
         started = clock.now()
+        policy = cfg.policy(
+            bbc, own_camera or cast(DepthSource, transport), command if device is None else standing(), started
+        )
+        control = SharedControl(policy, started)
+        controller = Controller(transport, bbc, control, limits=limits, clock=clock)
         if device is None:
-            script = Operator(command, started)
-            controller = Controller(transport, bbc, script, limits=limits, clock=clock)
-            procedure: Procedure | ByHand = Procedure(controller, script, cfg.seconds)
+            procedure: Procedure | ByHand = Procedure(controller, control, cfg.seconds)
         else:
-            control = SharedControl(task_policy(started), started)
-            controller = Controller(transport, bbc, control, limits=limits, clock=clock)
             procedure = ByHand(Operation(controller, control, device))
-        record = Recorder(episode, bbc)
+        record = Recorder(episode, bbc, policy if isinstance(policy, DeployedStudent) else None)
 
         def on_step(step: StepRecord) -> None:
             record(step)

@@ -8,6 +8,7 @@ Out: nothing but what there is to see. For an episode and pictures: recipes/perf
 
     python recipes/play.py
     python recipes/play.py runs/my_run --course bidirectional
+    python recipes/play.py pretrained/bbc_course --task runs/my_student --course full      # it decides, keys correct it
     python recipes/play.py --operator gamepad         # sticks steer, the browser shows
     python recipes/play.py --operator terminal        # keys in the terminal, no browser: for machines without one
 """
@@ -26,13 +27,15 @@ from typing import Annotated, Literal
 import mujoco
 import torch
 import tyro
-from controls import ControlsConfig, make_device, task_policy
+from controls import ControlsConfig, make_device
+from task_policy import TaskConfig, standing
 
 from agility_rl.deploy import Artifact, Controller, DeployedBBC, Mode, SafetyLimits
 from agility_rl.deploy.behaviour import torch_network
 from agility_rl.deploy.controller import StepRecord
 from agility_rl.deploy.operator import Operation, SharedControl
 from agility_rl.deploy.simulated import SimulatedBus, SimulatedRobot
+from agility_rl.deploy.simulated_camera import SimulatedCamera
 from agility_rl.go2.appearance import dress
 from agility_rl.training import cli
 
@@ -44,7 +47,7 @@ MOST_BEHIND = 0.1
 
 
 @dataclass(frozen=True)
-class Config(ControlsConfig):
+class Config(ControlsConfig, TaskConfig):
     artifact: Annotated[Path, tyro.conf.Positional] = SHIPPED
     """Artifact folder of a BBC, or a run with one."""
     operator: Literal["browser", "terminal", "gamepad"] = "browser"
@@ -131,7 +134,8 @@ def play(cfg: Config, interrupted: Callable[[], bool]) -> Controller:
     keys = {PUT_BACK.capitalize(): "back to the start"}
     with contextlib.closing(make_device(cfg.operator, cfg, lambda: robot.model, keys)) as device:
         bus = RealTimeBus(robot)
-        control = SharedControl(task_policy(bus.now()), bus.now())
+        policy = cfg.policy(bbc, SimulatedCamera(robot, now=bus.now), standing(), bus.now())
+        control = SharedControl(policy, bus.now())
         # Nobody is hurt by a simulated robot whose operator looks away.
         ages = {**SafetyLimits().source_age, "operator": math.inf}
         limits = SafetyLimits.from_manifest(bbc.manifest, source_age=ages)

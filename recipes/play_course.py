@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import mujoco
 import torch
@@ -11,8 +12,11 @@ from agility_rl import rotations
 from agility_rl.envs.arena import START_BEHIND
 from agility_rl.envs.course_presets import COURSES
 from agility_rl.envs.layout import CourseLayout
+from agility_rl.go2.model import build_spec
 from agility_rl.simulation.scenery import add_scenery
 
+FLOOR = ("type", "size", "contype", "conaffinity", "condim", "priority", "friction", "solref")
+"""What a course takes over from the floor on which it stands."""
 SEE_THROUGH = 0.25
 """Opacity of the walls, for the sake of whoever looks over them."""
 
@@ -47,3 +51,18 @@ def surround(name: str, seed: int) -> Callable[[mujoco.MjSpec], None]:
                     geom.rgba = (*geom.rgba[:3], SEE_THROUGH)
 
     return add
+
+
+def write_world(name: str, seed: int, file: Path) -> None:
+    """The same course as an MJCF file, for a robot in another process (:func:`agility_rl.deploy.simulated.add_world`).
+
+    Raises:
+        ValueError: if there is no such course.
+    """
+    add = surround(name, seed)
+    robot, world = build_spec().geom("floor"), mujoco.MjSpec()
+    like = {entry: getattr(robot, entry) for entry in FLOOR}
+    floor = world.worldbody.add_geom(name="floor", **like)
+    add(world)
+    world.delete(floor)  # the robot has brought its own
+    file.write_text(world.to_xml(), encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,6 +40,12 @@ class RobotConfig:
     """Step of the simulated physics and motors [s] (1,000 Hz: supplement S3)."""
     friction_loss: float | None = None
     """Dry friction of the simulated joints [N m]; as in training by default."""
+    course: str | None = None
+    """Obstacles around the simulated robot: a name of agility_rl.envs.COURSES, such as full."""
+    course_seed: int = 0
+    """What the course's places and heights are drawn with."""
+    world: Path | None = None
+    """MJCF file of what stands around the simulated robot, in place of a course; the robot starts at its origin."""
     simulator: Path | None = None
     """Motors and joints that the simulated robot truly has: a log's ``NAME.truth.json``, or ``result.json`` of
     ``easi.py``."""
@@ -59,8 +66,11 @@ class RobotConfig:
                 raise ValueError(
                     f"expected --{option} only with --transport {transport}, got --transport {self.transport}"
                 )
-        if self.real and self.simulator is not None:
-            raise ValueError("expected --simulator only with a simulated robot, got a real one")
+        for option in ("simulator", "course", "world"):
+            if self.real and getattr(self, option) is not None:
+                raise ValueError(f"expected --{option} only with a simulated robot, got a real one")
+        if self.course is not None and self.world is not None:
+            raise ValueError("expected --course or --world, got both")
 
     def options(self, manifest: Mapping[str, Any]) -> dict[str, Any]:
         """The simulated robot, for :class:`agility_rl.deploy.robot_process.RobotProcess`."""
@@ -77,14 +87,26 @@ class RobotConfig:
 
 
 @contextlib.contextmanager
-def connect(cfg: RobotConfig, options: Mapping[str, Any]) -> Iterator[tuple[Transport, RobotProcess | None]]:
-    """The way to the robot, and the process of a simulated one, which ends with the context."""
+def connect(
+    cfg: RobotConfig, options: Mapping[str, Any], camera: bool = False
+) -> Iterator[tuple[Transport, RobotProcess | None]]:
+    """The way to the robot, and the process of a simulated one, which ends with the context.
+
+    Args:
+        cfg: which robot, and how to reach it.
+        options: :meth:`RobotConfig.options`.
+        camera: a simulated robot sends depths with its states.
+    """
     line: dict[str, Any] = {}
     if cfg.transport == "dds":
         line["dds"] = {"domain": cfg.domain}
     elif cfg.transport == "lcm":
         line["lcm"] = {"url": address(cfg.domain, cfg.ttl)}
-    with contextlib.nullcontext() if cfg.real else RobotProcess(**line, **options) as process:
+    with contextlib.ExitStack() as stack:
+        process = None
+        if not cfg.real:
+            world = _world(cfg, Path(stack.enter_context(tempfile.TemporaryDirectory())))
+            process = stack.enter_context(RobotProcess(camera=camera, world=world, **line, **options))
         if cfg.transport == "dds":
             transport: Transport = DDSTransport(
                 cfg.interface, domain=cfg.domain, feet=cfg.feet, patience=CONNECT_SECONDS
@@ -94,7 +116,16 @@ def connect(cfg: RobotConfig, options: Mapping[str, Any]) -> Iterator[tuple[Tran
         else:
             assert process is not None
             transport = LoopbackTransport(process.port, patience=CONNECT_SECONDS)
-        try:
-            yield transport, process
-        finally:
-            transport.close()
+        stack.callback(transport.close)
+        yield transport, process
+
+
+def _world(cfg: RobotConfig, folder: Path) -> str | None:
+    """File of what stands around a simulated robot."""
+    if cfg.course is None:
+        return None if cfg.world is None else str(cfg.world)
+    from play_course import write_world  # the environments need the training stack, a robot does not
+
+    file = folder / "world.xml"
+    write_world(cfg.course, cfg.course_seed, file)
+    return str(file)

@@ -6,15 +6,15 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rollouts import Controller, load_controller
 from tsc_config import Config as TeacherConfig
 
 from agility_rl import behaviours, keys
 from agility_rl.deploy.artifact import Artifact, ArtifactError
+from agility_rl.deploy.task import check_camera
 from agility_rl.envs.obstacles import OBSTACLES
-from agility_rl.go2 import camera, constants, features
+from agility_rl.go2 import constants, features
 from agility_rl.modules import RecurrentStudent, Teacher
 
 NETWORKS: dict[str, type[Teacher] | type[RecurrentStudent]] = {"teacher": Teacher, "student": RecurrentStudent}
@@ -137,33 +137,3 @@ def trained_bbc(run: Path) -> Path:
         return Path(json.loads(file.read_text(encoding="utf-8"))["config"]["bbc"])
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{file} is damaged or no run's configuration: {error}; give the BBC as --bbc") from error
-
-
-def describe_camera() -> dict[str, Any]:
-    """The camera and what becomes of its images, for the manifest of a student."""
-    return {
-        "sensor": [camera.SENSOR_HEIGHT, camera.SENSOR_WIDTH],
-        "downsampling": camera.DOWNSAMPLING,
-        "crop": [camera.CROP_TOP, camera.CROP_BOTTOM, camera.CROP_LEFT, camera.CROP_RIGHT],
-        "image": [camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH],
-        "horizontal_field": camera.HORIZONTAL_FIELD,
-        "position": list(camera.POSITION),
-        "depth_range": [camera.DEPTH_NEAR, camera.DEPTH_FAR],
-        "normalised": "(clip(z, near, far) - near) / (far - near) - 0.5",
-        "units": "rows and columns; rad; m in the trunk's frame",
-    }
-
-
-def check_camera(artifact: Artifact) -> None:
-    """Refuse a student whose images were others.
-
-    Raises:
-        ArtifactError: at the first number that differs.
-    """
-    saved = artifact.manifest.get("camera", {})
-    for name, here in describe_camera().items():
-        if saved.get(name) != here:
-            raise ArtifactError(
-                f"{artifact.folder}: the student was trained with images of {name} {saved.get(name)}, this code's "
-                f"camera has {here}; use the release that wrote it, or train the student again"
-            )

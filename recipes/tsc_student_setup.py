@@ -10,13 +10,14 @@ import torch
 from rollouts import Controller
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
-from tsc_artifacts import Trained, describe_camera, load_bbc_of, load_trained, trained_bbc
+from tsc_artifacts import Trained, load_bbc_of, load_trained, trained_bbc
 from tsc_setup import Curriculum, make_env
 from tsc_student_config import AugmentationConfig, Config
 
 from agility_rl import keys
 from agility_rl.collectors import DAggerCollector
 from agility_rl.deploy.artifact import Artifact, ArtifactError, build_manifest
+from agility_rl.deploy.task import describe_camera
 from agility_rl.envs import AgilityEnv
 from agility_rl.go2 import features
 from agility_rl.losses import BYOLLoss, StudentLoss

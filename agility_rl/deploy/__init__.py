@@ -10,6 +10,7 @@ from agility_rl.deploy.controller import Controller, Mode
 from agility_rl.deploy.depth import DepthPreprocessor
 from agility_rl.deploy.operator import SharedControl
 from agility_rl.deploy.safety import SafetyLimits
+from agility_rl.deploy.task import DeployedStudent
 from agility_rl.deploy.transport import JointCommand, RobotState, Transport
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "Commander",
     "Controller",
     "DeployedBBC",
+    "DeployedStudent",
     "DepthPreprocessor",
     "JointCommand",
     "Mode",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 from types import ModuleType
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -20,6 +22,45 @@ _SAME_SURFACE = 16
 _UNSEEN = np.iinfo(np.uint16).max
 _SIZE = (camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)
 _FIRST = (camera.DOWNSAMPLING * camera.CROP_TOP, camera.DOWNSAMPLING * camera.CROP_LEFT)
+
+
+class Frame(NamedTuple):
+    """A depth image and when it was taken.
+
+    Attributes:
+        time: on the controller's clock [s].
+        image: ``[480, 848]``, uint16 counts of a millimetre, or floating-point metres; 0 where nothing was measured.
+    """
+
+    time: float
+    image: np.ndarray
+
+
+class DepthSource(Protocol):
+    """A camera: whatever takes the images, in its own time."""
+
+    def latest(self) -> Frame | None:
+        """The newest image, never waiting; ``None`` if there is none yet. The same one until the next."""
+
+
+class StillImage:
+    """A camera before a wall, whose images never grow old; for tests and measurements.
+
+    Args:
+        distance: of the wall [m].
+
+    Example:
+        >>> StillImage(2.0).latest().image[0, 0].item()
+        2000
+    """
+
+    def __init__(self, distance: float) -> None:
+        shape = (camera.SENSOR_HEIGHT, camera.SENSOR_WIDTH)
+        self.frame = Frame(math.inf, np.full(shape, round(distance / DEPTH_UNIT), dtype=np.uint16))
+
+    def latest(self) -> Frame:
+        """The wall."""
+        return self.frame
 
 
 class DepthPreprocessor:
@@ -149,3 +190,31 @@ def _opencv() -> ModuleType:
     except ImportError as error:
         raise ImportError("depth images need OpenCV: pip install 'agility_rl[video]'") from error
     return cv2
+
+
+def sensor_image(counts: np.ndarray) -> np.ndarray:
+    """Camera image of which :func:`downsample` makes ``counts``: each pixel as a block, nothing around the crop.
+
+    For simulated cameras, which cast one ray a pixel of the network and go the real camera's way from there.
+
+    Args:
+        counts: uint16 ``[58, 87]``, 0 where nothing was measured.
+
+    Returns:
+        uint16 ``[480, 848]``.
+
+    Raises:
+        ValueError: if the size is another.
+
+    Example:
+        >>> image = sensor_image(np.full((58, 87), 1200, dtype=np.uint16))
+        >>> image.shape, int(downsample(image)[0].min())
+        ((480, 848), 1200)
+    """
+    camera.check_image_size(counts.shape)
+    image = np.zeros((camera.SENSOR_HEIGHT, camera.SENSOR_WIDTH), dtype=np.uint16)
+    size = camera.DOWNSAMPLING
+    rows = slice(_FIRST[0], _FIRST[0] + size * _SIZE[0])
+    columns = slice(_FIRST[1], _FIRST[1] + size * _SIZE[1])
+    image[rows, columns] = np.repeat(np.repeat(counts, size, 0), size, 1)
+    return image

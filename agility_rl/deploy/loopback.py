@@ -1,6 +1,7 @@
 """States and commands as UDP packets on this machine: how the controller talks to a simulator in another process.
 
-Every packet ends with a CRC-32. Whoever has sent a command or a greeting gets states. The robot answers a greeting with
+Every packet ends with a CRC-32. A robot with a camera sends its depths along, one number for each pixel of the network.
+Whoever has sent a command or a greeting gets states. The robot answers a greeting with
 the names of its joints, and says in every state how many programs have lately commanded it.
 """
 
@@ -20,16 +21,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from agility_rl.deploy.depth import Frame, sensor_image
 from agility_rl.deploy.transport import JointCommand, RobotState
+from agility_rl.go2 import camera
 
 HOST = "127.0.0.1"
 """Only programs on this machine can reach the robot."""
-GREETING, NAMES, STATE, COMMAND = b"AGLg", b"AGLn", b"AGLs", b"AGLc"
+GREETING, NAMES, STATE, COMMAND, DEPTH = b"AGLg", b"AGLn", b"AGLs", b"AGLc", b"AGLd"
 """What a packet is: its first four bytes."""
-LARGEST = 4096
+LARGEST = 16384
 """More bytes than any packet has."""
 _STATE = struct.Struct("<IdII")  # sequence, time, commanders, whether the trunk's position is known
 _COMMAND = struct.Struct("<QI")  # session, sequence
+_DEPTH = struct.Struct("<d")  # time
 _STATE_SIZES = {
     "quaternion": 4,
     "angular_velocity": 3,
@@ -106,11 +110,36 @@ def unpack_command(body: bytes) -> tuple[JointCommand, int]:
     return JointCommand(*values), _COMMAND.unpack(body[: _COMMAND.size])[0]
 
 
+def pack_depth(moment: float, counts: np.ndarray) -> bytes:
+    """Depths uint16 ``[58, 87]`` as a packet, with the time at which they were measured [s].
+
+    Example:
+        >>> kind, body = unseal(pack_depth(1.5, np.full((58, 87), 700, dtype=np.uint16)))
+        >>> moment, counts = unpack_depth(body)
+        >>> moment, counts.shape, int(counts.max())
+        (1.5, (58, 87), 700)
+    """
+    return seal(DEPTH, _DEPTH.pack(moment) + counts.astype("<u2").tobytes())
+
+
+def unpack_depth(body: bytes) -> tuple[float, np.ndarray]:
+    """Time and depths.
+
+    Raises:
+        PacketError: if the length is wrong.
+    """
+    shape = (camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)
+    _check_length(body, _DEPTH.size + 2 * shape[0] * shape[1])
+    return _DEPTH.unpack_from(body)[0], np.frombuffer(body, "<u2", offset=_DEPTH.size).reshape(shape)
+
+
+def _check_length(body: bytes, expected: int) -> None:
+    if len(body) != expected:
+        raise PacketError(f"a packet has {len(body)} bytes, expected {expected}; made by another version?")
+
+
 def _floats(body: bytes, start: int, sizes: Sequence[int]) -> list[Tensor]:
-    if len(body) != start + 4 * sum(sizes):
-        raise PacketError(
-            f"a packet has {len(body)} bytes, expected {start + 4 * sum(sizes)}; made by another version?"
-        )
+    _check_length(body, start + 4 * sum(sizes))
     values = torch.from_numpy(np.frombuffer(body, "<f4", offset=start).astype(np.float32))
     return list(values.split(list(sizes)))
 
@@ -150,6 +179,7 @@ class LoopbackTransport:
         self._robot = (HOST, port)
         self._session, self._sequence = secrets.randbits(64), 0
         self._state: RobotState | None = None
+        self._frame: Frame | None = None
         self._commanders = 0
         self.rejected = 0
         self.joint_names: Sequence[str] = ()
@@ -178,6 +208,10 @@ class LoopbackTransport:
                 state, self._commanders = unpack_state(body)
                 if self._state is None or state.time >= self._state.time:  # datagrams may overtake each other
                     self._state = state
+            elif kind == DEPTH:
+                moment, counts = unpack_depth(body)
+                if self._frame is None or moment >= self._frame.time:
+                    self._frame = Frame(moment, sensor_image(counts))
             elif kind == NAMES:
                 self.joint_names = tuple(json.loads(body))
             else:
@@ -194,6 +228,10 @@ class LoopbackTransport:
                 return self._state
             except ConnectionRefusedError:  # the robot's process has ended: its last state grows old
                 return self._state
+
+    def latest(self) -> Frame | None:
+        """Newest image that came in with the states, if the robot has a camera."""
+        return self._frame
 
     def send(self, command: JointCommand) -> None:
         """Give the motors a command; lost if the robot's process has ended."""

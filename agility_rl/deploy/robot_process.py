@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -22,12 +23,14 @@ from agility_rl.deploy.loopback import (
     NAMES,
     Commanders,
     PacketError,
+    pack_depth,
     pack_state,
     seal,
     unpack_command,
     unseal,
 )
-from agility_rl.deploy.simulated import SimulatedRobot
+from agility_rl.deploy.simulated import SimulatedRobot, add_world
+from agility_rl.deploy.simulated_camera import FRAME_PERIOD, SimulatedCamera
 from agility_rl.go2 import constants
 
 STATE_PERIOD = 0.002
@@ -91,14 +94,16 @@ class RobotServer:
     Args:
         robot: what is stepped.
         port: to listen on; 0 takes a free one.
+        eye: the robot's camera; ``None`` if it is blind.
 
     Attributes:
         port: the port.
         rejected: packets that were damaged or unknown.
     """
 
-    def __init__(self, robot: SimulatedRobot, port: int = 0) -> None:
-        self.robot = robot
+    def __init__(self, robot: SimulatedRobot, port: int = 0, eye: SimulatedCamera | None = None) -> None:
+        self.robot, self.eye = robot, eye
+        self._seen = -FRAME_PERIOD
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((HOST, port))
         self._socket.setblocking(False)
@@ -131,16 +136,22 @@ class RobotServer:
                 self.rejected += 1
 
     def publish(self) -> None:
-        """Tell the state to everybody who has lately been heard."""
+        """Tell the state, and at its own rate what the camera sees, to everybody who has lately been heard."""
         now = time.monotonic()
         self._listeners = {who: last for who, last in self._listeners.items() if now - last <= LISTENER_MEMORY}
-        if self._listeners:
-            packet = pack_state(self.robot.state(now), self.commanders.count(now))
-            for listener in self._listeners:
-                try:
-                    self._socket.sendto(packet, listener)
-                except (ConnectionRefusedError, BlockingIOError):
-                    continue
+        if not self._listeners:
+            return
+        self._tell(pack_state(self.robot.state(now), self.commanders.count(now)))
+        if self.eye is not None and now - self._seen >= FRAME_PERIOD:
+            self._seen = now
+            self._tell(pack_depth(now, self.eye.counts()))
+
+    def _tell(self, packet: bytes) -> None:
+        for listener in self._listeners:
+            try:
+                self._socket.sendto(packet, listener)
+            except (ConnectionRefusedError, BlockingIOError):
+                continue
 
     def close(self) -> None:
         """Release the socket."""
@@ -156,6 +167,8 @@ class RobotProcess:
         dds: speak as a Go2 over DDS instead: keyword arguments ``interface`` and ``domain`` of
             :class:`agility_rl.deploy.dds.DDSRobot`; :attr:`port` is then 0.
         lcm: speak over LCM instead: keyword argument ``url`` of :class:`agility_rl.deploy.lcm.LCMRobot`; likewise.
+        camera: the robot sees, and sends its depths; over the loopback line only.
+        world: MJCF file of what stands around the robot (:func:`agility_rl.deploy.simulated.add_world`).
         **robot_options: keyword arguments of :class:`agility_rl.deploy.simulated.SimulatedRobot`, as JSON values.
 
     Attributes:
@@ -173,21 +186,24 @@ class RobotProcess:
         port: int = 0,
         dds: dict[str, Any] | None = None,
         lcm: dict[str, Any] | None = None,
+        camera: bool = False,
+        world: str | None = None,
         **robot_options: Any,
     ) -> None:
-        options = {"pose": pose, "port": port, "dds": dds, "lcm": lcm, **robot_options}
+        line = {"port": port, "dds": dds, "lcm": lcm, "camera": camera}
+        options = {"pose": pose, "world": world, "line": line, **robot_options}
         command = [sys.executable, "-m", __name__, json.dumps(options)]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
         self.lost = 0.0
         assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
+        first = self._process.stdout.readline()
+        if not first:
             self._process.communicate()
             raise RuntimeError(
                 f"the robot's process ended with status {self._process.returncode} before it began; see its message"
             )
-        self.port: int = json.loads(line)["port"]
+        self.port: int = json.loads(first)["port"]
 
     def __enter__(self) -> Self:
         return self
@@ -220,14 +236,14 @@ def serve_on(line: dict[str, Any], robot: SimulatedRobot) -> tuple[Served, int]:
         from agility_rl.deploy.lcm import LCMRobot
 
         return LCMRobot(robot, **line["lcm"]), 0
-    server = RobotServer(robot, line["port"])
+    server = RobotServer(robot, line["port"], SimulatedCamera(robot) if line["camera"] else None)
     return server, server.port
 
 
 def main(options: dict[str, Any]) -> None:
     """Body of the process: says its port, and ends when its input is closed, also by the death of who started it."""
-    pose, line = options.pop("pose"), {name: options.pop(name) for name in ("port", "dds", "lcm")}
-    robot = SimulatedRobot(**options)
+    pose, world, line = (options.pop(name) for name in ("pose", "world", "line"))
+    robot = SimulatedRobot(**options) if world is None else SimulatedRobot(**options, surround=add_world(Path(world)))
     robot.reset(pose)
     robot.advance(SETTLE_SECONDS)
     served, port = serve_on(line, robot)

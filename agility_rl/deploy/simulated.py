@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -21,6 +22,8 @@ COMMAND_TIMEOUT = 0.1
 """Without a new command for this long, the motors damp by themselves [s]."""
 LYING_HEIGHT = 0.09
 """Trunk height from which a folded robot is let down on the ground [m]."""
+PREFIX = "world/"
+"""Before the names of what :func:`add_world` adds."""
 _JOINTS, _SPEEDS = slice(7, 19), slice(6, 18)
 _FEET = [3 * group + axis for group in constants.FOOT_GROUPS for axis in range(3)]
 
@@ -133,6 +136,35 @@ class SimulatedRobot:
             trunk_position=position[:3],
             sequence=self._sequence,
         )
+
+
+def add_world(file: Path) -> Callable[[mujoco.MjSpec], None]:
+    """What adds the bodies of an MJCF file to a robot's model; the robot starts at its origin.
+
+    Args:
+        file: MJCF; its own ground, if it has one, comes on top of the robot's.
+
+    Raises:
+        ValueError: if the file cannot be read as MJCF (when it is added).
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder) / "step.xml"
+        ...     _ = file.write_text('<mujoco><worldbody><geom name="step" type="box" size="1 1 .1" pos="2 0 0"/>'
+        ...         "</worldbody></mujoco>")
+        ...     SimulatedRobot(surround=add_world(file)).model.geom("world/step").pos.tolist()
+        [2.0, 0.0, 0.0]
+    """
+
+    def add(spec: mujoco.MjSpec) -> None:
+        try:
+            world = mujoco.MjSpec.from_file(str(file))
+        except (ValueError, OSError) as error:
+            raise ValueError(f"{file}: expected an MJCF file of what stands around the robot: {error}") from error
+        spec.attach(world, frame=spec.worldbody.add_frame(), prefix=PREFIX)
+
+    return add
 
 
 class SimulatedBus:

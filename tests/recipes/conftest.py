@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from agility_rl.deploy.artifact import Artifact, build_manifest
+from agility_rl.deploy.task import describe_camera
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import features
 from agility_rl.modules import BasicBehaviourController, RecurrentStudent, Teacher
@@ -50,7 +51,7 @@ def make_student(untrained_teacher: Path, tmp_path: Path, module: Callable[[str]
         torch.manual_seed(seed)
         teacher = Artifact.load(untrained_teacher / "policy")
         network = RecurrentStudent(**teacher.manifest["network"], memory=16, encoder_hidden=8)
-        camera = module("tsc_artifacts").describe_camera()
+        camera = describe_camera()
         camera["training"] = {"frame_steps": 1, "latency": [1, 1], "pitch": 0.09, "offset_noise": 0.05}
         manifest = build_manifest("student", features.CONTROLLER_LAYOUTS, control_period=0.04)
         manifest |= {"network": network.settings, "camera": camera, "byol": byol, "course": "bar_jump"}

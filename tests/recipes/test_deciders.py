@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from agility_rl import keys
+from agility_rl.deploy.task import describe_camera
 from agility_rl.envs import COURSES, AgilityEnv
 from agility_rl.modules.student import NEXT_HIDDEN
 
@@ -37,7 +38,7 @@ def disturbances(module: Module) -> ModuleType:
 @pytest.fixture
 def perfect(module: Module, make_student: Callable[..., Path], deciders: ModuleType, untrained: Path) -> Any:
     """A student whose camera errs in nothing, which decides every second control step."""
-    camera = module("tsc_artifacts").describe_camera() | {"training": PERFECT}
+    camera = describe_camera() | {"training": PERFECT}
     return deciders.load_decider(make_student(camera=camera), untrained)
 
 
@@ -134,6 +135,6 @@ def test_a_student_is_evaluated_under_disturbance(
     assert names == {"course_bar_jump.png", "course_bar_jump_noise.png", "course_behaviours.png"}
     with pytest.raises(ValueError, match="teacher has no camera to disturb; give a student"):
         recipe.evaluate(recipe.Config(untrained_teacher, disturbance=("noise",), **options), console)
-    wrong = make_student("wrong", camera=module("tsc_artifacts").describe_camera() | {"depth_range": [0.3, 2.0]})
+    wrong = make_student("wrong", camera=describe_camera() | {"depth_range": [0.3, 2.0]})
     with pytest.raises(ValueError, match=r"images of depth_range \[0.3, 2.0\], this code's camera has \[0.3, 4.0\]"):
         recipe.evaluate(recipe.Config(wrong, **options), console)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -97,11 +99,55 @@ def test_and_over_lcm_a_robot_that_is_softer_than_it_is_told(
     assert found[knees].tolist() == pytest.approx([30.0] * 4, rel=0.05), "three quarters of what it is told"
 
 
+def test_a_student_decides_by_what_it_sees_of_a_course(
+    deploy: ModuleType,
+    untrained: Path,
+    make_student: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = tmp_path / "run.mcap"
+    patient = {"state_age": 600.0, "operator_age": 600.0, "depth_age": 600.0, "missed_deadlines": 10**9}
+    limits = {"seconds": 1.0, "pose": "standing", "friction_loss": 0.0}
+    cfg = deploy.Config(untrained, task=make_student(), course="bar_jump", output=path, **limits, **patient)
+    status = deploy.main(cfg)
+    printed = capsys.readouterr().out
+    assert "run        requested" in printed, printed
+    assert status == 0 or "fault: tilt" in printed, "an untrained robot may fall"
+    episode = read_episode(path)
+    running = episode["controller/estimated_height"] != 0.0
+    assert bool(running.any()) and len(episode["perceived/heading"][running].unique()) > 1, "images reach it"
+    assert len(episode["perceived/heading"][~running].unique()) <= 2, "it looks only while it runs"
+    assert len(RobotLog.load(path).transitions()) > 0
+
+
+def test_a_student_needs_a_camera(
+    deploy: ModuleType, untrained: Path, make_student: Callable[..., Path], tmp_path: Path, monkeypatch: Any
+) -> None:
+    student = make_student()
+    with pytest.raises(ValueError, match="a student looks by a camera: the simulated robot of"):
+        deploy.main(deploy.Config(untrained, task=student, transport="dds", output=tmp_path / "run.mcap"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text("class Blind: ...\nclass Eye:\n    def latest(self): return None\n")
+    load_camera = deploy.load_camera
+    assert load_camera("mine:Eye").latest() is None
+    for text, message in (
+        ("mine:Blind", "mine:Blind made Blind, expected something with latest()"),
+        ("mine:Other", "expected MODULE:NAME of a class or function, got 'mine:Other'"),
+        ("nowhere:Eye", "expected MODULE:NAME of a class or function, got 'nowhere:Eye'"),
+        ("mine", "expected MODULE:NAME of a class or function, got 'mine'"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            load_camera(text)
+
+
 def test_an_option_of_another_transport_is_named(deploy: ModuleType, untrained: Path, tmp_path: Path) -> None:
     for options, message in (
         ({"interface": "eth0"}, "--interface only with --transport dds, got --transport mujoco"),
         ({"ttl": 1}, "--ttl only with --transport lcm, got --transport mujoco"),
         ({"ttl": 1, "transport": "lcm", "simulator": tmp_path}, "--simulator only with a simulated robot, got a real"),
+        ({"ttl": 1, "transport": "lcm", "course": "full"}, "--course only with a simulated robot, got a real"),
+        ({"course": "full", "world": tmp_path}, "expected --course or --world, got both"),
     ):
         with pytest.raises(ValueError, match=message):
             deploy.main(deploy.Config(untrained, output=tmp_path / "run.mcap", **options))

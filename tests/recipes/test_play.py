@@ -123,6 +123,18 @@ def test_a_robot_in_real_time_is_driven_by_hand_and_recorded(
     assert float(episode["command/velocity_x"][0]) == 0.0
 
 
+def test_a_student_decides_until_a_person_does(
+    terminal: Callable[..., Terminal], untrained: Path, make_student: Callable[..., Path]
+) -> None:
+    arguments = ("--task", make_student(), "--course", "tunnel", "--pose", "standing", "--operator", "terminal")
+    person = terminal("play", untrained, *arguments)
+    assert person.sees("run: trot"), person.text[-500:]  # nobody asked for it: without a student, it is a walk
+    person.press("5")
+    assert person.sees("run: jump"), person.text[-500:]
+    person.press(" ")
+    assert person.sees("run: trot"), person.text[-500:]
+
+
 def test_no_terminal_no_run(recipe: Callable[..., subprocess.CompletedProcess[str]]) -> None:
     result = recipe("play", "--operator", "terminal")
     assert result.returncode == 2 and "expected a terminal" in result.stderr

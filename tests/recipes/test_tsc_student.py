@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from agility_rl.deploy.artifact import Artifact
+from agility_rl.deploy.task import describe_camera
 from agility_rl.go2 import camera
 from agility_rl.modules import RecurrentStudent
 from agility_rl.record.mcap_logger import read_scalars
@@ -174,7 +175,7 @@ def test_bad_options_give_one_clear_line(
 def test_another_camera_another_teacher_and_other_sizes_are_refused(
     recipe: ModuleType, smoke: Any, module: Module, make_student: Callable[..., Path]
 ) -> None:
-    seen = module("tsc_artifacts").describe_camera() | {"image": [60, 106]}
+    seen = describe_camera() | {"image": [60, 106]}
     wrong = make_student("wrong", camera=seen)
     with pytest.raises(ValueError, match=r"images of image \[60, 106\], this code's camera has \[58, 87\]"):
         recipe.train(replace(smoke, init_from=wrong))
