@@ -79,8 +79,6 @@ class Config(RobotConfig, ControlsConfig, TaskConfig):
     """Turn rate [rad/s], likewise."""
     height: float | None = None
     """Trunk height, of a jump the highest [m], likewise."""
-    backend: Literal["torch", "onnx"] = "torch"
-    """What computes the network; onnx needs an exported artifact and onnxruntime."""
     output: Path | None = None
     """File to record to, ending in .mcap; ``runs/deploy/deploy_N.mcap`` by default. Nothing is overwritten."""
     state_age: float = SafetyLimits.state_age

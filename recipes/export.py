@@ -1,14 +1,16 @@
-"""Make a controller ready for a robot: a complete manifest, ONNX beside the weights, and proof that they agree.
+"""Make a controller or a student ready for a robot: a complete manifest, ONNX beside the weights, and proof that they
+agree.
 
-The controller is driven in the training environment, all five behaviours, and what it saw is put through the
-environment's own policy, the network of ``agility_rl.deploy`` by PyTorch, and the ONNX file by onnxruntime. Nothing is
-written unless they agree. An artifact of an earlier format becomes one of the present.
+It is driven in the training environment (a controller in all five behaviours, a student over its course), what it saw
+is put through the training's own policy, the network of ``agility_rl.deploy`` by PyTorch, and the ONNX file by
+onnxruntime. Nothing is written unless they agree. An artifact of an earlier format becomes one of the present.
 
-In:  a run or artifact folder of a BBC.
+In:  a run or artifact folder of a BBC or of a student.
 Out: ``--output`` (the same artifact folder by default) with ``manifest.json``, ``weights-*.safetensors``,
      ``policy-*.onnx``; the ONNX file carries the manifest as metadata.
 
     python recipes/export.py runs/my_run [--output exported/my_bbc]
+    python recipes/export.py runs/my_student --bbc pretrained/bbc_course
 
 Needs the extra ``export``: pip install 'agility_rl[export]'.
 """
@@ -20,6 +22,7 @@ import io
 import json
 import logging
 import warnings
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,34 +31,73 @@ from typing import Annotated, Any
 import torch
 import tyro
 from rollouts import Controller, drive, load_controller, make_env
+from student_rollout import SAID, recorded_steps
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from tsc_artifacts import load_trained
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS, NUM_BEHAVIOURS, command_bounds
+from agility_rl.deploy import behaviour, task
 from agility_rl.deploy.artifact import CHECKSUM, Artifact, ArtifactError, build_manifest
-from agility_rl.deploy.behaviour import INPUTS, OUTPUTS, BBCNetwork, example_inputs, onnx_network
 from agility_rl.go2 import features
+from agility_rl.modules import RecurrentStudent
 from agility_rl.training import cli
 
 SAME_NETWORK = 1e-6
-"""Largest difference of an action between the training policy and the deployed network, both by PyTorch."""
+"""Largest difference of an output between the training policy and the deployed network, both by PyTorch."""
 SAME_ANSWER = 1e-5
-"""Largest difference of an action or an estimate between PyTorch and onnxruntime."""
+"""Largest difference of an output between PyTorch and onnxruntime."""
 _WRITTEN_ANEW = ("format", "format_version", "weights", "onnx", CHECKSUM, "limits", "normalisers")
 
 
 @dataclass(frozen=True)
 class Config:
     run: Annotated[Path, tyro.conf.Positional]
-    """Run or artifact folder of a BBC."""
+    """Run or artifact folder of a BBC or student."""
     output: Path | None = None
     """Folder to write; the artifact's own by default."""
+    bbc: Path | None = None
+    """With a student: folder of the controller of its training, where its run does not say so."""
     steps: int = 300
-    """Control steps that each behaviour is driven for."""
+    """Control steps that each behaviour is driven for; of a student, decisions."""
     seed: int = 0
     """Of the start states."""
+
+
+@dataclass(frozen=True)
+class Exportable:
+    """A network, and what it has to answer.
+
+    Attributes:
+        artifact: where it comes from.
+        network: for deployment.
+        inputs: names of its inputs.
+        outputs: names of its outputs.
+        example: one row of inputs.
+        seen: inputs ``[M, ...]`` that were recorded.
+        expected: what the training's own policy answered to them.
+        by_onnx: the same network of an artifact with an ONNX file.
+        facts: what the manifest has to say besides.
+        what: to print.
+    """
+
+    artifact: Artifact
+    network: nn.Module
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+    example: tuple[Tensor, ...]
+    seen: tuple[Tensor, ...]
+    expected: tuple[Tensor, ...]
+    by_onnx: Callable[[Artifact], Callable[..., tuple[Tensor, ...]]]
+    facts: Mapping[str, Any]
+    what: str
+
+    @property
+    def size(self) -> int:
+        """Number of recorded inputs."""
+        return len(self.seen[0])
 
 
 def recorded_inputs(controller: Controller, steps: int, seed: int) -> TensorDict:
@@ -63,21 +105,66 @@ def recorded_inputs(controller: Controller, steps: int, seed: int) -> TensorDict
     low, high = command_bounds()
     schedule = [(steps, torch.arange(NUM_BEHAVIOURS), (low + high) / 2)]
     env = make_env(NUM_BEHAVIOURS, controller, None, num_threads=1, seed=seed)
-    seen = [td.select(*INPUTS) for td in drive(controller.bbc, env, schedule)]
+    seen = [td.select(*behaviour.INPUTS) for td in drive(controller.bbc, env, schedule)]
     env.close()
     return torch.cat(seen)  # type: ignore[arg-type]
 
 
-def to_onnx(network: BBCNetwork, metadata: dict[str, Any]) -> bytes:
+def controller_to_export(cfg: Config) -> Exportable:
+    """A Basic Behaviour Controller, and what it answers."""
+    controller = load_controller(cfg.run)
+    seen = recorded_inputs(controller, cfg.steps, cfg.seed)
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        said = controller.bbc.deployable_policy()(seen.clone())
+    return Exportable(
+        controller.artifact,
+        behaviour.BBCNetwork(controller.bbc.eval().requires_grad_(False)),
+        behaviour.INPUTS,
+        behaviour.OUTPUTS,
+        behaviour.example_inputs(),
+        tuple(seen[name] for name in behaviour.INPUTS),
+        (said[keys.ACTION], said[keys.ESTIMATE]),
+        behaviour.onnx_network,
+        {
+            "simulation": {
+                "friction_loss": controller.friction_loss,
+                **controller.artifact.manifest.get("simulation", {}),
+            }
+        },
+        ", ".join(BEHAVIOURS),
+    )
+
+
+def student_to_export(cfg: Config) -> Exportable:
+    """A student, and what it decides on its course."""
+    trained = load_trained(cfg.run, "student")
+    student = trained.network
+    assert isinstance(student, RecurrentStudent)
+    seen, said = recorded_steps(trained, cfg.bbc, cfg.steps, cfg.seed)
+    return Exportable(
+        trained.artifact,
+        task.StudentNetwork(student.eval().requires_grad_(False)),
+        task.INPUTS,
+        task.OUTPUTS,
+        task.example_inputs(student.memory.hidden_size),
+        tuple(seen[name] for name in task.INPUTS),
+        tuple(said[name] for name in SAID),
+        task.onnx_student,
+        {},
+        f"decisions on the course {trained.course!r}",
+    )
+
+
+def to_onnx(export: Exportable, metadata: dict[str, Any]) -> bytes:
     """The network as an ONNX model that carries JSON values."""
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # the exporter's remarks about packages it could use
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            network,
-            example_inputs(),
-            input_names=list(INPUTS),
-            output_names=list(OUTPUTS),
+            export.network,
+            export.example,
+            input_names=list(export.inputs),
+            output_names=list(export.outputs),
             external_data=False,
             dynamo=True,
             verbose=False,
@@ -93,102 +180,102 @@ def to_onnx(network: BBCNetwork, metadata: dict[str, Any]) -> bytes:
     return model.SerializeToString(deterministic=True)
 
 
-def difference(ours: Tensor, theirs: Tensor) -> float:
+def difference(ours: Sequence[Tensor], theirs: Sequence[Tensor]) -> float:
     """Largest absolute difference; NaN counts as infinite."""
-    return float((ours - theirs).abs().nan_to_num(torch.inf).max())
+    return max(float((a - b).abs().nan_to_num(torch.inf).max()) for a, b in zip(ours, theirs, strict=True))
 
 
 @torch.no_grad()
-def check_network(controller: Controller, network: BBCNetwork, seen: TensorDict, where: Path) -> tuple[Tensor, Tensor]:
-    """Actions and estimates of the deployed network, which must be the training policy's.
+def check_network(export: Exportable) -> tuple[Tensor, ...]:
+    """Answers of the deployed network, which must be the training policy's.
 
     Raises:
         ArtifactError: if they differ.
     """
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        trained = controller.bbc.deployable_policy()(seen.clone())
-    action, estimate = network(*(seen[name] for name in INPUTS))
-    worst = max(difference(action, trained[keys.ACTION]), difference(estimate, trained[keys.ESTIMATE]))
+    rows = [export.network(*(values[index : index + 1] for values in export.seen)) for index in range(export.size)]
+    answers = tuple(torch.cat(column) for column in zip(*rows, strict=True))
+    worst = difference(answers, export.expected)
     if not worst <= SAME_NETWORK:
         raise ArtifactError(
-            f"{where}: the network for deployment differs from the training policy by {worst:.2e}, expected at most "
-            f"{SAME_NETWORK:.0e}; nothing was exported"
+            f"{export.artifact.folder}: the network for deployment differs from the training policy by {worst:.2e}, "
+            f"expected at most {SAME_NETWORK:.0e}; nothing was exported"
         )
-    return action, estimate
+    return answers
 
 
-def check_onnx(artifact: Artifact, seen: TensorDict, action: Tensor, estimate: Tensor) -> float:
+def check_onnx(export: Exportable, artifact: Artifact, answers: Sequence[Tensor]) -> float:
     """Largest difference between onnxruntime and PyTorch.
 
     Raises:
         ArtifactError: if it is too large.
     """
-    run = onnx_network(artifact)
-    rows = [run(*(seen[name][index : index + 1] for name in INPUTS)) for index in range(len(seen))]
-    found = torch.cat([row[0] for row in rows]), torch.cat([row[1] for row in rows])
-    worst = max(difference(found[0], action), difference(found[1], estimate))
+    run, size = export.by_onnx(artifact), export.size
+    rows = [run(*(values[index : index + 1] for values in export.seen)) for index in range(size)]
+    worst = difference([torch.cat(column) for column in zip(*rows, strict=True)], answers)
     if not worst <= SAME_ANSWER:
         raise ArtifactError(
-            f"{artifact.folder}: onnxruntime and PyTorch differ by {worst:.2e} on {len(seen)} recorded inputs, "
+            f"{artifact.folder}: onnxruntime and PyTorch differ by {worst:.2e} on {size} recorded inputs, "
             f"expected at most {SAME_ANSWER:.0e}; nothing was exported"
         )
     return worst
 
 
-def complete_manifest(controller: Controller) -> dict[str, Any]:
+def complete_manifest(export: Exportable) -> dict[str, Any]:
     """The manifest of the training, with what the present format asks for besides."""
-    trained = {k: v for k, v in controller.artifact.manifest.items() if k not in _WRITTEN_ANEW}
+    trained = {k: v for k, v in export.artifact.manifest.items() if k not in _WRITTEN_ANEW}
     for name, layout in features.CONTROLLER_LAYOUTS.items():
-        controller.artifact.check_layout(name, layout)
-    now = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=trained["control_period"])
-    simulation = {"friction_loss": controller.friction_loss, **trained.get("simulation", {})}
-    return {**now, **trained, "units": now["units"], "simulation": simulation, "exported_with": now["versions"]}
+        export.artifact.check_layout(name, layout)
+    now = build_manifest(trained["kind"], features.CONTROLLER_LAYOUTS, control_period=trained["control_period"])
+    return {**now, **trained, "units": now["units"], **export.facts, "exported_with": now["versions"]}
 
 
 def main(cfg: Config) -> Path:
     """Export, check, write; returns the folder."""
     if cfg.steps < 1:
         raise ValueError(f"expected --steps of at least 1, got {cfg.steps}")
-    controller = load_controller(cfg.run)
-    output = controller.artifact.folder if cfg.output is None else cfg.output
-    manifest = complete_manifest(controller)
-    network = BBCNetwork(controller.bbc.eval().requires_grad_(False))
-    seen = recorded_inputs(controller, cfg.steps, cfg.seed)
-    action, estimate = check_network(controller, network, seen, controller.artifact.folder)
-    weights = controller.artifact.manifest["weights"]["sha256"]
-    content = to_onnx(network, {**manifest, "weights_sha256": weights})
+    export = student_to_export(cfg) if kind_of(cfg.run) == "student" else controller_to_export(cfg)
+    source = export.artifact
+    output = source.folder if cfg.output is None else cfg.output
+    manifest, answers = complete_manifest(export), check_network(export)
+    weights = source.manifest["weights"]["sha256"]
+    content = to_onnx(export, {**manifest, "weights_sha256": weights})
     digest = hashlib.sha256(content).hexdigest()
     entry = {
         "file": f"policy-{digest[:16]}.onnx",
         "sha256": digest,
         "weights_sha256": weights,
-        "inputs": {name: list(value.shape) for name, value in zip(INPUTS, example_inputs(), strict=True)},
-        "outputs": list(OUTPUTS),
-        "checked_on": f"{len(seen)} recorded inputs",
+        "inputs": {name: list(value.shape) for name, value in zip(export.inputs, export.example, strict=True)},
+        "outputs": list(export.outputs),
+        "checked_on": f"{export.size} recorded inputs",
     }
     output.mkdir(parents=True, exist_ok=True)
     onnx_file = output / entry["file"]
     present = onnx_file.exists()
     onnx_file.write_bytes(content)
-    trial = Artifact(controller.artifact.state, {**controller.artifact.manifest, "onnx": entry}, output)
     try:
-        entry["largest_difference"] = check_onnx(trial, seen, action, estimate)
+        trial = Artifact(source.state, {**source.manifest, "onnx": entry}, output)
+        entry["largest_difference"] = check_onnx(export, trial, answers)
     except BaseException:
         if not present:
             onnx_file.unlink()
         raise
-    artifact = Artifact.save(output, controller.artifact.state, {**manifest, "onnx": entry})
+    artifact = Artifact.save(output, source.state, {**manifest, "onnx": entry})
     for old in output.glob("policy-*.onnx"):
         if old.name != entry["file"]:
             old.unlink()
     if artifact.manifest["weights"]["sha256"] != weights:
         raise ArtifactError(f"{output}: the weights changed while they were written; export again")
     print(
-        f"{output}: {', '.join(BEHAVIOURS)} checked on {len(seen)} recorded inputs; PyTorch and onnxruntime differ by "
+        f"{output}: {export.what} checked on {export.size} recorded inputs; PyTorch and onnxruntime differ by "
         f"{entry['largest_difference']:.1e} at most (allowed {SAME_ANSWER:.0e})\n"
         f"{onnx_file.name}: {len(content) / 1e6:.2f} MB"
     )
     return output
+
+
+def kind_of(run: Path) -> str:
+    """What a folder holds; a folder that is none is for others to refuse."""
+    return str(Artifact.load(run).manifest["kind"]) if run.is_dir() else "bbc"
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from controls import ControlsConfig, make_device
 from task_policy import TaskConfig, standing
 
 from agility_rl.deploy import Artifact, Controller, DeployedBBC, Mode, SafetyLimits
-from agility_rl.deploy.behaviour import torch_network
+from agility_rl.deploy.behaviour import onnx_network, torch_network
 from agility_rl.deploy.controller import StepRecord
 from agility_rl.deploy.operator import Operation, SharedControl
 from agility_rl.deploy.simulated import SimulatedBus, SimulatedRobot
@@ -104,10 +104,10 @@ class Start:
             controller.request(self._left.pop(0))
 
 
-def load(folder: Path) -> DeployedBBC:
+def load(cfg: Config) -> DeployedBBC:
     """The controller, ready to run."""
-    artifact = Artifact.load(folder, kind="bbc")
-    return DeployedBBC(torch_network(artifact), artifact)
+    artifact = Artifact.load(cfg.artifact, kind="bbc")
+    return DeployedBBC(onnx_network(artifact) if cfg.backend == "onnx" else torch_network(artifact), artifact)
 
 
 def surroundings(cfg: Config) -> Callable[[mujoco.MjSpec], object]:
@@ -127,7 +127,7 @@ def surroundings(cfg: Config) -> Callable[[mujoco.MjSpec], object]:
 
 def play(cfg: Config, interrupted: Callable[[], bool]) -> Controller:
     """Until interrupted, or for some simulated time."""
-    bbc = load(cfg.artifact)
+    bbc = load(cfg)
     friction = bbc.manifest.get("simulation", {}).get("friction_loss", 0.0)
     robot = SimulatedRobot(friction_loss=friction, skin=cfg.skin, surround=surroundings(cfg))
     robot.reset(cfg.pose)

@@ -6,11 +6,12 @@ import importlib
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from agility_rl.deploy import Artifact, BehaviourCommand, DeployedBBC, DeployedStudent, Operator
 from agility_rl.deploy.commander import Commander
 from agility_rl.deploy.depth import DepthSource
+from agility_rl.deploy.task import onnx_student, torch_student
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,6 +19,8 @@ class TaskConfig:
     task: Path | None = None
     """Run or artifact folder of a student (tsc_student.py), which then decides by depth images; the controller must be
     the one that it was trained on."""
+    backend: Literal["torch", "onnx"] = "torch"
+    """What computes the networks; onnx needs exported artifacts and onnxruntime."""
 
     def policy(self, bbc: DeployedBBC, eyes: DepthSource, otherwise: BehaviourCommand, now: float) -> Commander:
         """The student, or a constant command.
@@ -28,8 +31,9 @@ class TaskConfig:
         if self.task is None:
             return Operator(otherwise, now)
         artifact = Artifact.load(self.task, kind="student")
+        network = onnx_student(artifact) if self.backend == "onnx" else torch_student(artifact)
         weights = bbc.manifest["weights"]["sha256"]
-        return DeployedStudent(artifact, eyes, period=bbc.period, bbc_weights=weights)
+        return DeployedStudent(network, artifact, eyes, period=bbc.period, bbc_weights=weights)
 
 
 def standing() -> BehaviourCommand:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +12,7 @@ from torch import Tensor, nn
 from agility_rl import keys, rotations
 from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.deploy.commander import BehaviourCommand
+from agility_rl.deploy.onnx import onnx_session
 from agility_rl.deploy.transport import RobotState
 from agility_rl.go2 import constants, features
 from agility_rl.modules import BasicBehaviourController
@@ -102,31 +101,9 @@ def onnx_network(artifact: Artifact) -> Network:
         ArtifactError: if the artifact has no ONNX file, or it is not the one that was checked at the export.
         ImportError: if onnxruntime is not installed.
     """
-    entry: dict[str, Any] = artifact.manifest.get("onnx", {})
-    name = str(entry.get("file", ""))
-    if not name or Path(name).name != name or not (artifact.folder / name).is_file():
-        raise ArtifactError(f"{artifact.folder} has no ONNX file beside the manifest; write it with recipes/export.py")
     artifact.check_layout(keys.PROPRIOCEPTION, features.PROPRIOCEPTION_LAYOUT)
     artifact.check_layout(keys.EXPLICIT, features.EXPLICIT_LAYOUT)
-    content = (artifact.folder / name).read_bytes()
-    digest = hashlib.sha256(content).hexdigest()
-    if digest != entry.get("sha256") or entry.get("weights_sha256") != artifact.manifest["weights"]["sha256"]:
-        raise ArtifactError(
-            f"{artifact.folder / name} has SHA-256 {digest[:12]}, expected {str(entry.get('sha256'))[:12]} made from "
-            f"weights {artifact.manifest['weights']['sha256'][:12]}: altered, or of another training; export it again"
-        )
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-
-    def network(*inputs: Tensor) -> tuple[Tensor, Tensor]:
-        feed = {name: value.numpy() for name, value in zip(INPUTS, inputs, strict=True)}
-        action, estimate = session.run(list(OUTPUTS), feed)
-        return torch.from_numpy(action), torch.from_numpy(estimate)
-
-    return network
+    return cast(Network, onnx_session(artifact, INPUTS, OUTPUTS))
 
 
 class DeployedBBC:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +13,7 @@ from agility_rl import behaviours, keys
 from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.deploy.commander import BehaviourCommand, Perception
 from agility_rl.deploy.depth import DepthPreprocessor, DepthSource
+from agility_rl.deploy.onnx import onnx_session
 from agility_rl.go2 import camera, features
 from agility_rl.modules import RecurrentStudent
 from agility_rl.modules.student import HEADING_SCALE, PERCEIVED_HEADING, PERCEIVED_OBSTACLE
@@ -20,6 +21,9 @@ from agility_rl.modules.student import HEADING_SCALE, PERCEIVED_HEADING, PERCEIV
 StudentNet = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
 """Depth [1, 58, 87], proprioception [1, 45], history [1, 10, 45] and memory [1, H] to logits [1, 5], parameters
 [1, 5, 6], heading errors [1, 2], obstacle logits [1, K] and the memory of the next step [1, H]."""
+
+INPUTS = (keys.DEPTH, keys.PROPRIOCEPTION, keys.HISTORY, keys.HIDDEN)
+OUTPUTS = ("logits", "parameters", "heading", "obstacle", "memory")
 
 
 class StudentNetwork(nn.Module):
@@ -42,7 +46,6 @@ class StudentNetwork(nn.Module):
 
     def __init__(self, student: RecurrentStudent) -> None:
         super().__init__()
-        self.memory_size: int = student.memory.hidden_size
         self.encoder: nn.Module = student.depth_encoder.module
         self.memory = student.memory
         self.estimator: nn.Module = student.estimator.module
@@ -80,7 +83,8 @@ class DeployedStudent:
     Source: supplement, sections S3 and S6; commands from parameters: Table S2 and method notes, section 5.1.
 
     Args:
-        artifact: of kind ``student``.
+        network: :func:`torch_student` or :func:`onnx_student`.
+        artifact: of the same student.
         eyes: where images come from.
         period: control step of the behaviour controller [s].
         bbc_weights: SHA-256 of its weights; another than the student was trained with is refused.
@@ -90,7 +94,7 @@ class DeployedStudent:
         obstacle: index of the perceived type of obstacle.
 
     Raises:
-        ArtifactError: if it is no student, of another camera, or was trained with another behaviour controller.
+        ArtifactError: if it was trained with another behaviour controller.
 
     Example:
         >>> import tempfile
@@ -102,33 +106,29 @@ class DeployedStudent:
         ...     network=student.settings, camera=describe_camera(), bbc="abc")
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     artifact = Artifact.save(folder, student.state_dict(), manifest)
-        >>> task = DeployedStudent(artifact, StillImage(2.0), period=0.02, bbc_weights="abc")
+        >>> task = DeployedStudent(torch_student(artifact), artifact, StillImage(2.0), period=0.02, bbc_weights="abc")
         >>> task.steps, task.decide(Perception(0.0, RobotState.standing(), torch.zeros(45), torch.zeros(4))).name in (
         ...     behaviours.BEHAVIOURS)
         (5, True)
     """
 
-    def __init__(self, artifact: Artifact, eyes: DepthSource, *, period: float, bbc_weights: str) -> None:
-        network = student_network(artifact)
+    def __init__(
+        self, network: StudentNet, artifact: Artifact, eyes: DepthSource, *, period: float, bbc_weights: str
+    ) -> None:
         expected = str(artifact.manifest.get("bbc"))
         if expected != bbc_weights:
             raise ArtifactError(
                 f"{artifact.folder} was trained on the BBC {expected[:12]}, but the robot runs {bbc_weights[:12]}; "
                 "give the artifact of that one"
             )
-        self.network: StudentNet = network
+        self.network = network
         self.eyes, self.steps = eyes, max(1, round(artifact.manifest["control_period"] / period))
-        self._memory_size = network.memory_size
+        self._memory_size = int(artifact.manifest["network"]["memory"])
         self._preprocess = DepthPreprocessor()
         with torch.inference_mode():
             for _ in range(10):  # the first calls allocate
-                network(*self._empty())
+                network(*example_inputs(self._memory_size))
         self.reset()
-
-    def _empty(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        size = features.NUM_PROPRIOCEPTION
-        image = torch.zeros(1, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)
-        return image, torch.zeros(1, size), torch.zeros(1, features.HISTORY, size), torch.zeros(1, self._memory_size)
 
     def reset(self) -> None:
         """Forget everything: the robot is about to start."""
@@ -176,11 +176,44 @@ class DeployedStudent:
         return {"depth": -math.inf if frame is None else frame.time}
 
 
-def student_network(artifact: Artifact) -> StudentNetwork:
-    """The network of an artifact.
+def example_inputs(memory: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Zeros in the shapes that the network of a student with so large a memory takes."""
+    size = features.NUM_PROPRIOCEPTION
+    image = torch.zeros(1, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)
+    return image, torch.zeros(1, size), torch.zeros(1, features.HISTORY, size), torch.zeros(1, memory)
+
+
+def torch_student(artifact: Artifact) -> StudentNetwork:
+    """The network of an artifact, by PyTorch.
 
     Raises:
         ArtifactError: if it is no student, its images were others, or the weights are not those of its network.
+    """
+    check_student(artifact)
+    student = RecurrentStudent(**artifact.manifest["network"])
+    try:
+        student.load_state_dict(artifact.state)
+    except RuntimeError as error:
+        raise ArtifactError(f"{artifact.folder}: the weights are not those of the network it names: {error}") from error
+    return StudentNetwork(student.eval().requires_grad_(False))
+
+
+def onnx_student(artifact: Artifact) -> StudentNet:
+    """The network of an artifact, by onnxruntime on one thread.
+
+    Raises:
+        ArtifactError: if it is no student, or has no ONNX file that was checked at the export.
+        ImportError: if onnxruntime is not installed.
+    """
+    check_student(artifact)
+    return cast(StudentNet, onnx_session(artifact, INPUTS, OUTPUTS))
+
+
+def check_student(artifact: Artifact) -> None:
+    """Refuse what is no student of this code's camera and observations.
+
+    Raises:
+        ArtifactError: naming what differs.
     """
     manifest = artifact.manifest
     if manifest["kind"] != "student" or "network" not in manifest:
@@ -190,12 +223,6 @@ def student_network(artifact: Artifact) -> StudentNetwork:
         )
     artifact.check_layout(keys.PROPRIOCEPTION, features.PROPRIOCEPTION_LAYOUT)
     check_camera(artifact)
-    student = RecurrentStudent(**manifest["network"])
-    try:
-        student.load_state_dict(artifact.state)
-    except RuntimeError as error:
-        raise ArtifactError(f"{artifact.folder}: the weights are not those of the network it names: {error}") from error
-    return StudentNetwork(student.eval().requires_grad_(False))
 
 
 def describe_camera() -> dict[str, Any]:

@@ -44,3 +44,9 @@ def test_easi_collection_prints_a_share_of_the_bare_engine(repository: Path) -> 
 def test_depth_prints_its_rate_beside_bare_rays(repository: Path) -> None:
     output = run(repository, "benchmarks/depth.py", "--robots=2", "--threads=1", "--rounds=1")
     assert "bare mj_multiRay" in output and output.count("x bare") == 3
+
+
+@pytest.mark.slow
+def test_control_step_prints_times_and_memory(repository: Path) -> None:
+    output = run(repository, "benchmarks/control_step.py", "pretrained/bbc_course", "--steps=20")
+    assert "20 control steps" in output and "p99" in output and "memory" in output

@@ -21,7 +21,7 @@ from agility_rl.deploy.controller import Controller, Mode
 from agility_rl.deploy.deadlines import ManualClock
 from agility_rl.deploy.depth import DepthPreprocessor, Frame, StillImage, sensor_image
 from agility_rl.deploy.operator import SharedControl
-from agility_rl.deploy.task import DeployedStudent, StudentNetwork, describe_camera, student_network
+from agility_rl.deploy.task import DeployedStudent, StudentNetwork, describe_camera, torch_student
 from agility_rl.deploy.transport import FakeBus, RobotState
 from agility_rl.go2 import features
 from agility_rl.modules import RecurrentStudent
@@ -61,7 +61,8 @@ class Camera:
 
 
 def deployed_student(artifact: Artifact, bbc: Artifact, eyes: Camera | StillImage) -> DeployedStudent:
-    return DeployedStudent(artifact, eyes, period=0.02, bbc_weights=bbc.manifest["weights"]["sha256"])
+    weights = bbc.manifest["weights"]["sha256"]
+    return DeployedStudent(torch_student(artifact), artifact, eyes, period=0.02, bbc_weights=weights)
 
 
 def scene(generator: torch.Generator) -> np.ndarray:
@@ -170,14 +171,14 @@ def test_a_person_corrects_it_and_gives_back(save: Callable[..., Artifact], arti
 
 def test_what_does_not_fit_is_refused(save: Callable[..., Artifact], artifact: Artifact) -> None:
     with pytest.raises(ArtifactError, match="expected a student of tsc_student"):
-        student_network(artifact)
+        torch_student(artifact)
     with pytest.raises(ArtifactError, match=r"images of image \[60, 106\], this code's camera has \[58, 87\]"):
-        student_network(save(camera=describe_camera() | {"image": [60, 106]}))
+        torch_student(save(camera=describe_camera() | {"image": [60, 106]}))
     with pytest.raises(ArtifactError, match="was trained on the BBC other, but the robot runs"):
         deployed_student(save(bbc="other"), artifact, StillImage(1.0))
     good = save()
     with pytest.raises(ArtifactError, match="not those of the network it names"):
-        student_network(replace(good, manifest=good.manifest | {"network": good.manifest["network"] | {"memory": 8}}))
+        torch_student(replace(good, manifest=good.manifest | {"network": good.manifest["network"] | {"memory": 8}}))
 
 
 def test_the_network_has_no_memory_of_its_own(student: RecurrentStudent) -> None:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
 
 from agility_rl.deploy.artifact import Artifact, ArtifactError
-from agility_rl.deploy.behaviour import BBCNetwork, onnx_network, torch_network
+from agility_rl.deploy.behaviour import onnx_network, torch_network
+from agility_rl.deploy.task import onnx_student, torch_student
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
@@ -64,10 +67,10 @@ def test_a_mismatch_is_refused_and_nothing_is_written(
 ) -> None:
     convert = export.to_onnx
 
-    def of_another_network(network: BBCNetwork, metadata: dict) -> bytes:
-        other = copy.deepcopy(network)
+    def of_another_network(exportable: Any, metadata: dict) -> bytes:
+        other = copy.deepcopy(exportable.network)
         other.mean.layers[-1].bias += 2e-5
-        return convert(other, metadata)
+        return convert(replace(exportable, network=other), metadata)
 
     monkeypatch.setattr(export, "to_onnx", of_another_network)
     output = tmp_path / "exported"
@@ -77,13 +80,40 @@ def test_a_mismatch_is_refused_and_nothing_is_written(
 
 
 def test_a_network_that_is_not_the_trained_policy_is_refused(export: ModuleType, untrained: Path) -> None:
-    controller = export.load_controller(untrained)
-    seen = export.recorded_inputs(controller, 2, 0)
-    network = copy.deepcopy(BBCNetwork(controller.bbc))
+    exportable = export.controller_to_export(export.Config(untrained, steps=2))
+    network = copy.deepcopy(exportable.network)
     with torch.no_grad():
         network.mean.layers[-1].bias += 1e-5
     with pytest.raises(ArtifactError, match=r"differs from the training policy by 1\.0"):
-        export.check_network(controller, network, seen, untrained)
+        export.check_network(replace(exportable, network=network))
+
+
+def test_a_student_is_exported_with_its_memory(
+    export: ModuleType, untrained: Path, make_student: Callable[..., Path], tmp_path: Path
+) -> None:
+    run, output = make_student(), tmp_path / "exported"
+    assert export.main(export.Config(run, bbc=untrained, output=output, steps=12)) == output
+    artifact = Artifact.load(output, kind="student")
+    entry = artifact.manifest["onnx"]
+    assert entry["checked_on"] == "48 recorded inputs" and entry["largest_difference"] <= 1e-5
+    assert entry["inputs"] == {
+        "depth": [1, 58, 87],
+        "proprioception": [1, 45],
+        "history": [1, 10, 45],
+        "hidden": [1, 16],
+    }
+    assert artifact.manifest["camera"] == Artifact.load(run).manifest["camera"]
+    generator = torch.Generator().manual_seed(7)
+    networks = torch_student(artifact), onnx_student(artifact)
+    memories = [torch.zeros(1, 16), torch.zeros(1, 16)]
+    for _ in range(20):  # the memory does not drift apart
+        depth = torch.rand(1, 58, 87, generator=generator) - 0.5
+        rest = [torch.randn(1, *shape, generator=generator) for shape in ((45,), (10, 45))]
+        answers = [net(depth, *rest, memory) for net, memory in zip(networks, memories, strict=True)]
+        assert export.difference(*answers) <= 1e-5
+        memories = [answer[-1] for answer in answers]
+    with pytest.raises(ArtifactError, match="no ONNX file beside the manifest"):
+        onnx_student(Artifact.load(run))
 
 
 def test_steps_must_be_positive(export: ModuleType, untrained: Path) -> None:
