@@ -14,6 +14,7 @@ from tsc_config import CurriculumConfig, RobotsConfig
 
 from agility_rl.go2 import camera
 from agility_rl.modules.student import HEADING_GATE
+from agility_rl.training.precision import Precision
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,8 @@ class Config:
     """Train the encoder by BYOL too (supplement S2, S8)."""
     bits: Literal[8, 16] = 8
     """How images are stored."""
+    precision: Precision = "float32"
+    """Of the depth encoder's layers; ``auto`` is bfloat16 on a CPU that multiplies in it, about twice as fast."""
     memory: int = 512
     """Units of the GRU (supplement S6)."""
     encoder_hidden: int = 128
@@ -154,6 +157,7 @@ CPU = Config(
     iterations=1200,
     max_minutes=240.0,
     checkpoint_every=25,
+    precision="auto",
     env=EnvConfig(num_robots=64, randomize=False, push_interval=None),
     imitation=ImitationConfig(minibatches=4, decay=1200),
     representation=RepresentationConfig(images=384, minibatches=1),

@@ -23,6 +23,7 @@ from agility_rl.go2 import features
 from agility_rl.losses import BYOLLoss, StudentLoss
 from agility_rl.modules import BYOL, DepthAugmentation, RecurrentStudent, Teacher
 from agility_rl.training.checkpoint import RunCheckpoint
+from agility_rl.training.precision import hidden_precision
 from agility_rl.training.seeding import Seeds, seed_everything
 
 
@@ -112,6 +113,7 @@ def build(cfg: Config, trained: Trained) -> Components:
     student.estimator.requires_grad_(False)  # it estimates what can be measured: imitation shall not bend it
     # A tenth to a third less time for the convolutions on a CPU.
     student.depth_encoder.to(memory_format=torch.channels_last)
+    student.depth_encoder.module.precision = hidden_precision(cfg.precision)
     imitation = cfg.imitation
     return Components(
         seeds=seeds,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -59,6 +60,10 @@ class DepthEncoder(TensorDictModule):
 class DepthNetwork(nn.Module):
     """The layers of :class:`DepthEncoder`, tensor in, tensor out.
 
+    Attributes:
+        precision: number format of the layers; weights, images and features are float32 whatever it is. With
+            ``torch.bfloat16`` a training takes half the time where the processor multiplies in it.
+
     Example:
         >>> import torch
         >>> DepthNetwork(58, 87, (32, 64), 128, 32)(torch.zeros(2, 3, 58, 87)).shape
@@ -71,6 +76,7 @@ class DepthNetwork(nn.Module):
         if min(rows, columns) < 1:
             raise ValueError(f"images must have at least 10 rows and columns for kernels (5, 3), got {height}, {width}")
         self.height, self.width = height, width
+        self.precision = torch.float32
         self.convolutions = nn.Sequential(
             *(nn.Conv2d(1, channels[0], 5), nn.MaxPool2d(2, 2), nn.ELU()),
             *(nn.Conv2d(channels[0], channels[1], 3), nn.ELU()),
@@ -83,4 +89,6 @@ class DepthNetwork(nn.Module):
         """Map images ``[*B, H, W]`` to features ``[*B, F]``."""
         check_image_size(depth.shape, self.height, self.width)
         images = dequantize(depth).reshape(-1, 1, self.height, self.width)  # [N, channels, H, W]
-        return self.linear(self.convolutions(images)).reshape(*depth.shape[:-2], -1)
+        with torch.autocast(images.device.type, self.precision, enabled=self.precision is not torch.float32):
+            features = self.linear(self.convolutions(images))
+        return features.float().reshape(*depth.shape[:-2], -1)

@@ -49,3 +49,17 @@ def test_errors() -> None:
         DepthEncoder().module(torch.zeros(2, 87, 58))
     with pytest.raises(ValueError, match="at least 10 rows"):
         DepthEncoder(height=6)
+
+
+def test_layers_in_bfloat16_leave_features_and_gradients_in_float32() -> None:
+    torch.manual_seed(0)
+    encoder, images = DepthEncoder(), torch.rand(8, 58, 87) - 0.5
+    exact = encoder.module(images)
+    encoder.module.precision = torch.bfloat16
+    seen: list[torch.dtype] = []
+    encoder.module.convolutions.register_forward_hook(lambda module, args, out: seen.append(out.dtype))
+    features = encoder.module(images)
+    assert seen == [torch.bfloat16] and features.dtype is torch.float32
+    torch.testing.assert_close(features, exact, rtol=0.05, atol=0.01)
+    features.square().sum().backward()
+    assert all(parameter.grad.dtype is torch.float32 for parameter in encoder.parameters())
