@@ -152,6 +152,10 @@ def load_script(text: str, bbc: Path | None) -> Decider:
         ValueError: if it is no script.
     """
     script = Script.parse(text)
+    if not script.complete:
+        raise ValueError(
+            f"--script: {text!r} leaves decisions to a teacher, and there is none; say what it does usually"
+        )
     label = "script_" + text.replace(":", "_").replace(",", "_").replace("=", "_")
     controller = load_controller(bbc or TeacherConfig().bbc)
     return Decider(script.decide, 1, controller, label, None, None, "full", script.behaviours)

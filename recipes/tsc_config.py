@@ -59,6 +59,7 @@ class PPOConfig:
     precision: Precision = "float32"
     """Of the hidden layers in the update; ``auto`` is bfloat16 on a CPU that multiplies in it, about twice as fast."""
     initial_std: float = 1.0
+    """At the start; a teacher of ``--init-from`` that has more begins with this."""
     min_std: float = 0.1
     hidden: tuple[int, ...] = (512, 256, 128)
     """Supplement S6."""
@@ -88,7 +89,8 @@ class CloningConfig:
     iterations: int = 0
     """Roll-outs in which the teacher copies a script before it learns by itself (ours; 0: not at all)."""
     script: str = "trot:1.2"
-    """BEHAVIOUR:SPEED, and OBSTACLE=BEHAVIOUR:SPEED after commas, as ``evaluate_course.py --script`` takes it."""
+    """BEHAVIOUR:SPEED, and OBSTACLE=BEHAVIOUR:SPEED after commas, as ``evaluate_course.py --script`` takes it. With
+    ``own`` in place of the first, a teacher of ``--init-from`` is corrected before those and keeps the rest."""
     scripted: float = 0.5
     """Share of the robots that the script drives meanwhile; the teacher sees where its own choices lead with the
     rest, and is told there too what the script would do."""

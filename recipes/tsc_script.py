@@ -17,6 +17,8 @@ from agility_rl.envs.obstacles import OBSTACLES
 
 STEERING = 2.0
 """Turn rate that is commanded for each radian of heading error [1/s]."""
+OWN = "own"
+"""In place of a decision: the teacher decides as it did before, and the script says nothing."""
 TURN = behaviours.COMMANDS.index("yaw_rate")
 
 
@@ -25,7 +27,7 @@ class Script:
     """A behaviour and a speed for each type of obstacle.
 
     Attributes:
-        skill: int64 ``[7]``, behaviour before each of :data:`OBSTACLES`.
+        skill: int64 ``[7]``, behaviour before each of :data:`OBSTACLES`; -1 where it says nothing.
         parameters: ``[7, 5, 6]``, forward speed of the chosen behaviour, everything else in the middle of its range.
     """
 
@@ -36,11 +38,13 @@ class Script:
     def parse(cls, text: str, option: str = "--script") -> Script:
         """Read ``BEHAVIOUR:SPEED``, speed in m/s, and after commas what differs, ``OBSTACLE=BEHAVIOUR:SPEED``.
 
+        ``own`` in place of the first says something about the others only.
+
         Raises:
             ValueError: if it is no such text, there is no such obstacle, or the behaviour has no such speed.
         """
         usual, *others = text.split(",")
-        chosen = dict.fromkeys(OBSTACLES, _read(usual, text, option))
+        chosen = dict.fromkeys(OBSTACLES, (-1, 0.0) if usual == OWN else _read(usual, text, option))
         for other in others:
             name, _, decision = other.partition("=")
             if name not in OBSTACLES:
@@ -48,16 +52,23 @@ class Script:
             chosen[name] = _read(decision, text, option)
         parameters = torch.zeros(len(OBSTACLES), behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS)
         for row, (skill, speed) in enumerate(chosen.values()):
-            parameters[row, skill, 0] = speed
+            if skill >= 0:
+                parameters[row, skill, 0] = speed
         return cls(torch.tensor([skill for skill, _ in chosen.values()]), parameters)
 
     @property
     def behaviours(self) -> tuple[str, ...]:
         """Those that it chooses."""
-        return tuple(behaviours.BEHAVIOURS[index] for index in self.skill.unique().tolist())
+        return tuple(behaviours.BEHAVIOURS[index] for index in self.skill.unique().tolist() if index >= 0)
+
+    @property
+    def complete(self) -> bool:
+        """Whether it says something before every obstacle."""
+        return bool((self.skill >= 0).all())
 
     def decide(self, td: TensorDictBase) -> TensorDictBase:
-        """Decisions of ``N`` robots under ``action``; each behaviour's turn rate leads to the way-point."""
+        """Decisions of ``N`` robots under ``action``; each behaviour's turn rate leads to the way-point. Where it says
+        nothing, the behaviour is -1."""
         kind = td[keys.OBSTACLE].argmax(-1)
         _, fastest = behaviours.command_bounds()
         parameters = self.parameters[kind].clone()

@@ -92,12 +92,20 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
 
 
 def begin(parts: Components, cfg: Config) -> None:
-    """Where a new run starts from: another run's teacher, or a copied script."""
+    """Where a new run starts from: another run's teacher, a copied script, or the one corrected by the other."""
     if cfg.init_from is not None:
         parts.teacher.load_state_dict(Artifact.load(cfg.init_from, kind="teacher").state)
-    elif cfg.cloning.iterations:
+        deviation = parts.teacher.actor.network.parameters_head.std.data
+        deviation.clamp_(max=cfg.ppo.initial_std)
+    if copies(cfg):
         set_course(parts.env, parts.curriculum)
         clone(parts, cfg.cloning)
+
+
+def copies(cfg: Config) -> bool:
+    """Whether a new run copies its script: one that starts from a teacher does so where the script says ``own``."""
+    complete = Script.parse(cfg.cloning.script, "--cloning.script").complete
+    return cfg.cloning.iterations > 0 and complete == (cfg.init_from is None)
 
 
 def train(cfg: Config) -> Path:
@@ -106,8 +114,12 @@ def train(cfg: Config) -> Path:
     if unknown := sorted(set(cfg.behaviours) - set(BEHAVIOURS)):
         raise ValueError(f"--behaviours: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
     script = Script.parse(cfg.cloning.script, "--cloning.script")
-    copies = cfg.cloning.iterations > 0 and cfg.init_from is None
-    if copies and (forbidden := sorted(set(script.behaviours) - set(cfg.behaviours))):
+    if not script.complete and cfg.init_from is None and cfg.resume is None:
+        raise ValueError(
+            f"--cloning.script {cfg.cloning.script} keeps what a teacher does; give it by --init-from, or a script "
+            "that says what it does usually"
+        )
+    if copies(cfg) and (forbidden := sorted(set(script.behaviours) - set(cfg.behaviours))):
         raise ValueError(
             f"--cloning.script {cfg.cloning.script} chooses {', '.join(forbidden)}, which --behaviours leaves out; "
             "give another script, or --cloning.iterations 0"

@@ -17,6 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from agility_rl import keys
 from agility_rl.behaviours import skill_index
 from agility_rl.deploy.artifact import Artifact
+from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.modules.hybrid_actor import FORBIDDEN
 
 Module = Callable[[str], ModuleType]
@@ -30,14 +31,19 @@ def smoke(module: Module, untrained: Path, tmp_path: Path) -> Any:
 
 
 def test_losses_by_hand(module: Module) -> None:
+    cloning, allowed = module("tsc_cloning"), torch.tensor([True, True, False])
     logits = torch.tensor([[0.0, math.log(3.0), FORBIDDEN]])
     said = TensorDict({"logits": logits, "loc": torch.zeros(1, 3, 1)}, [1])
     parameters = torch.tensor([[[2.0], [1.0], [2.0]]])
-    label = TensorDict({keys.BEHAVIOUR: torch.tensor([1]), keys.PARAMETERS: parameters}, [1])
-    losses = module("tsc_cloning").imitation(said, label, 0.2, torch.tensor([True, True, False]))
+    told = TensorDict({keys.BEHAVIOUR: torch.tensor([1]), keys.PARAMETERS: parameters}, [1])
+    losses = cloning.imitation(said, cloning.targets(told, said, 0.2, allowed))
     # choices of 1/4 and 3/4, labels of 0.1 and 0.9; what is not allowed has no share of either
     assert losses["behaviour"].item() == pytest.approx(0.1 * math.log(4.0) + 0.9 * math.log(4.0 / 3.0))
     assert losses["parameters"].item() == pytest.approx((4.0 + 1.0 + 4.0) / 3.0)
+    told[keys.BEHAVIOUR] = torch.tensor([-1])  # it says nothing: entropy of what was said before, and no error
+    losses = cloning.imitation(said, cloning.targets(told, said, 0.2, allowed))
+    assert losses["behaviour"].item() == pytest.approx(0.25 * math.log(4.0) + 0.75 * math.log(4.0 / 3.0))
+    assert losses["parameters"].item() == 0.0
 
 
 def test_the_script_drives_its_share(module: Module, smoke: Any) -> None:
@@ -64,6 +70,45 @@ def test_a_teacher_does_what_it_has_copied(module: Module, smoke: Any) -> None:
     speed = td[keys.ACTION, keys.PARAMETERS][td[keys.ACTION, keys.BEHAVIOUR] == skill_index("trot")][:, 2, 0]
     torch.testing.assert_close(speed, torch.full_like(speed, 0.8), atol=0.2, rtol=0.0)  # 1.4 m/s of 0.5 to 1.5
     parts.env.close()
+
+
+def test_a_teacher_is_corrected_before_some_obstacles_and_keeps_the_rest(module: Module, smoke: Any) -> None:
+    cloning, robots = module("tsc_cloning"), replace(smoke.env, num_robots=32)
+    parts = module("tsc_setup").build(replace(smoke, env=robots))
+    tunnel = list(OBSTACLES).index("tunnel")
+
+    def says() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        torch.manual_seed(0)
+        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+            td = parts.teacher.privileged_policy()(seen.clone())
+        return td[keys.OBSTACLE].argmax(-1) == tunnel, td["logits"].softmax(-1), td["loc"]
+
+    own = replace(smoke.cloning, script="trot:1.4", iterations=4, epochs=10, learning_rate=3e-3)
+    cloning.clone(parts, own)
+    seen = parts.env.reset()
+    _, before, parameters = says()
+    losses = cloning.clone(parts, replace(own, script="own,tunnel=walk:0.4", iterations=8))
+    there, after, corrected = says()
+    assert 0 < there.sum() < 32 and losses["parameters"] < 0.05
+    assert (after[there].argmax(-1) == skill_index("walk")).all()
+    assert (after[~there].argmax(-1) == skill_index("trot")).all()
+    assert (after - before)[~there].abs().mean() < 0.1 and (corrected - parameters)[~there].abs().mean() < 0.1
+    parts.env.close()
+
+
+def test_own_needs_a_teacher(module: Module, smoke: Any) -> None:
+    recipe = module("tsc_teacher")
+    cfg = replace(smoke, cloning=replace(smoke.cloning, script="own,tunnel=walk:0.4"))
+    with pytest.raises(ValueError, match=r"keeps what a teacher does; give it by --init-from"):
+        recipe.train(cfg)
+    with pytest.raises(ValueError, match="leaves decisions to a teacher, and there is none"):
+        module("deciders").load_script("own,tunnel=walk:0.4", smoke.bbc)
+    first = recipe.train(replace(smoke, iterations=1))
+    calm = replace(smoke.ppo, initial_std=0.12)
+    second = recipe.train(replace(cfg, name="second", iterations=1, init_from=first, ppo=calm))
+    states = [Artifact.load(run / "policy").state for run in (first, second)]
+    name = next(name for name in states[0] if name.endswith("parameters_head.std"))
+    assert states[0][name].mean() > 0.25 and states[1][name].max() < 0.15, "it begins with less to try"
 
 
 def test_a_bad_script_is_refused_before_anything_is_trained(module: Module, smoke: Any) -> None:

@@ -48,6 +48,13 @@ def test_obstacles_may_have_decisions_of_their_own(script: Any) -> None:
     assert chosen.behaviours == ("walk", "canter", "jump")
 
 
+def test_own_says_nothing_but_before_the_obstacles_it_names(script: Any) -> None:
+    chosen = script.parse("own,tunnel=canter:0.8")
+    action = chosen.decide(seen(["bar_jump", "tunnel"], [0.0] * 2))["action"]
+    assert action["behaviour"].tolist() == [-1, BEHAVIOURS.index("canter")]
+    assert chosen.behaviours == ("canter",) and not chosen.complete and script.parse("trot:1.2").complete
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
