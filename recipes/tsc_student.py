@@ -103,6 +103,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     if iteration == 0 and cfg.pretrain.images > 0 and cfg.init_from is None:
         metrics |= pretrain(parts, cfg, None if byol is None else lambda images: represent(parts, iteration, images))
         lap("pretrain")
+    parts.collector.led = round(parts.env.num_robots * annealed(own.led, 0.0, iteration, own.led_until))
     window = parts.collector.collect()
     lap("collect")
     metrics |= judge(parts.env, parts.curriculum, window)
@@ -122,6 +123,10 @@ def check(cfg: Config) -> None:
     own, pre = cfg.imitation, cfg.pretrain
     if min(own.steps, own.epochs, own.minibatches, own.decay, cfg.representation.minibatches) < 1:
         raise ValueError("expected imitation.steps, epochs, minibatches, decay and representation.minibatches above 0")
+    if not 0.0 <= own.led <= 1.0 or own.led_until < 1:
+        raise ValueError(
+            f"--imitation.led: expected a share from 0 to 1 and led-until above 0, got {own.led} and {own.led_until}"
+        )
     if cfg.bits not in (8, 16):
         raise ValueError(f"--bits: images are stored in 8 or 16 bits, got {cfg.bits}")
     smallest = min(cfg.representation.images, cfg.env.num_robots * own.steps) // cfg.representation.minibatches

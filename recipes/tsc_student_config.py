@@ -75,6 +75,10 @@ class ImitationConfig:
     """Of the errors to the current and the next way-point (method notes, section 5.9)."""
     compared: Literal["all", "selected"] = "all"
     """Whose parameters are compared: of all behaviours (method notes, section 5.9), or of the teacher's choice."""
+    led: float = 0.0
+    """Share of the robots that do what the teacher says, at first; it falls to 0 (ours; Ross et al. 2011)."""
+    led_until: int = 150
+    """Iteration from which the student acts alone."""
     augment: bool = True
     """Whether the images of the imitation are disturbed too (method notes, section 5.10)."""
 
@@ -159,7 +163,7 @@ CPU = Config(
     checkpoint_every=25,
     precision="auto",
     env=EnvConfig(num_robots=64, randomize=False, push_interval=None),
-    imitation=ImitationConfig(minibatches=4, decay=1200),
+    imitation=ImitationConfig(minibatches=4, decay=1200, led=0.8),
     representation=RepresentationConfig(images=384, minibatches=1),
     curriculum=CurriculumConfig(difficulty=1.0, obstacles=6, practice=1.0),
 )

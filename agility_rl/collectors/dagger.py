@@ -41,6 +41,10 @@ class DAggerCollector:
         action_key: key of the actions.
         label_key: where the teacher's action is stored.
 
+    Attributes:
+        led: so many robots, the first ones, do what the teacher says; a beginner by itself would see little but its own
+            falls. Ross et al. mix the policies likewise (their beta).
+
     Raises:
         ValueError: if the environment has no batch dimension or no images, the memory has another number of rows, there
             is no step, or the teacher reads an entry that the environment does not have.
@@ -101,6 +105,7 @@ class DAggerCollector:
         self.keep_next = [*keep_next, "done", "terminated", "truncated"]
         self.depth_key, self.hidden_key, self.next_hidden_key = depth_key, hidden_key, next_hidden_key
         self.action_key, self.label_key = action_key, label_key
+        self.led = 0
         self._initial_hidden = initial_hidden.detach().clone()
         self._carrier: TensorDictBase | None = None
 
@@ -110,7 +115,7 @@ class DAggerCollector:
 
         Returns:
             TensorDict ``[T, N]``: the kept observations, ``is_init`` bool [T, N, 1], ``hidden`` [T, N, M], which is the
-            memory before the first step at every step and takes memory once, the student's ``action``, the teacher's
+            memory before the first step at every step and takes memory once, the ``action`` taken, the teacher's
             ``label``, and ``("next", ...)``.
         """
         carrier = self._begin() if self._carrier is None else self._carrier
@@ -121,8 +126,11 @@ class DAggerCollector:
                 acting = self.student(carrier.select(*self.student.in_keys))
                 label = self.teacher(carrier.select(*self.teacher.in_keys)).get(self.action_key)
             row = carrier.select(*self.keep)
-            row.set(self.action_key, _decision(acting.get(self.action_key)))
-            row.set(self.label_key, _decision(label))
+            action, label = _decision(acting.get(self.action_key)), _decision(label)
+            if self.led:
+                action[: self.led] = label[: self.led]
+            row.set(self.action_key, action)
+            row.set(self.label_key, label)
             full, upcoming = self.env.step_and_maybe_reset(row.select(self.action_key).clone())
             row.set("next", full.get("next").select(*self.keep_next))
             rows.append(row)

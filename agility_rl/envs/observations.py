@@ -73,7 +73,8 @@ class ObservationGroups:
         """All observation groups, ``[N]``."""
         return TensorDict(
             {
-                keys.PROPRIOCEPTION: self.history[:, -1],
+                # Not a view: a matrix product rounds otherwise where rows lie apart, and a resumed run has none.
+                keys.PROPRIOCEPTION: self.history[:, -1].clone(),
                 keys.EXPLICIT: features.explicit(state.root_height, state.linear_velocity),
                 keys.PRIVILEGED: privileged,
                 keys.HISTORY: self.history,

@@ -133,3 +133,16 @@ def test_errors(env: AgilityEnv, student: RecurrentStudent, teacher: Teacher) ->
     blind.close()
     with pytest.raises(ValueError, match=r"initial_hidden must be \[3, M\], got \[2, 16\]"):
         collector(env, student, teacher, initial_hidden=student.initial_hidden(2))
+
+
+def test_the_first_robots_may_be_led(env: AgilityEnv, student: RecurrentStudent, teacher: Teacher) -> None:
+    collect = collector(env, student, teacher)
+    collect.led = 2
+    window = collect.collect()
+    taken, told = window[keys.ACTION, keys.BEHAVIOUR], window[keys.LABEL, keys.BEHAVIOUR]
+    parameters = [window[key, keys.PARAMETERS] for key in (keys.ACTION, keys.LABEL)]
+    assert torch.equal(taken[:, :2], told[:, :2]) and torch.equal(parameters[0][:, :2], parameters[1][:, :2])
+    assert not torch.equal(parameters[0][:, 2], parameters[1][:, 2]), "the third goes its own way"
+    collect.led = 0
+    window = collect.collect()
+    assert not torch.equal(window[keys.ACTION, keys.PARAMETERS][:, 0], window[keys.LABEL, keys.PARAMETERS][:, 0])
