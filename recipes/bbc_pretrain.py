@@ -171,7 +171,7 @@ def begin(parts: Components, cfg: Config) -> None:
     """Where a new run starts from: labels for Q^c, and another run's policy or the labelled clips."""
     warm_up_predictor(parts, cfg.imitation)
     if cfg.init_from:
-        parts.bbc.load_state_dict(Artifact.load(cfg.init_from, kind="bbc").state)
+        Artifact.load(cfg.init_from, kind="bbc").fill(parts.bbc)
     elif cfg.imitation.cloning:
         error = clone_behaviour(parts.bbc, parts.demonstrations, cfg.imitation.cloning)
         print(f"cloned {len(parts.dataset.labelled_clips)} labelled clips: squared action error {error:.3f}")

@@ -92,7 +92,7 @@ def build(cfg: Config) -> Components:
         if cfg.init_from is None:
             raise ValueError("--imitation.anchor holds on to the policy of --init-from RUN; give both or neither")
         anchor = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std).requires_grad_(False)
-        anchor.load_state_dict(Artifact.load(cfg.init_from, kind="bbc").state)
+        Artifact.load(cfg.init_from, kind="bbc").fill(anchor)
     critic_keys = [keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.COMMAND, keys.PEAK]
     critic_keys += [keys.HISTORY] if ppo.critic_history else []
     width = sum(env.observation_spec[key].shape[1:].numel() for key in critic_keys)

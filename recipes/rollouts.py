@@ -96,10 +96,7 @@ def load_controller(path: Path) -> Controller:
     if "network" not in artifact.manifest:
         raise ArtifactError(f"{artifact.folder}: the manifest lacks 'network'; export the policy with bbc_pretrain.py")
     bbc = BasicBehaviourController(**artifact.manifest["network"])
-    try:
-        bbc.load_state_dict(artifact.state)
-    except RuntimeError as error:
-        raise ArtifactError(f"{artifact.folder}: the weights are not those of the network it names: {error}") from error
+    artifact.fill(bbc)
     file = run / "config.json"
     trained = json.loads(file.read_text(encoding="utf-8"))["config"] if file.is_file() else {}
     return Controller(bbc, artifact, trained, run, trained.get("env", {}).get("friction_loss", 0.0))

@@ -100,10 +100,7 @@ def load_trained(path: Path, kind: str | None = None, allowed: Sequence[str] | N
             raise ValueError(f"--behaviours: expected some of those that it was trained with, {names}; got {allowed}")
     module = NETWORKS[manifest["kind"]](**network)
     mask = module.actor.network.mask.clone()
-    try:
-        module.load_state_dict(artifact.state)
-    except RuntimeError as error:
-        raise ArtifactError(f"{artifact.folder}: the weights are not those of the network it names: {error}") from error
+    artifact.fill(module)
     module.actor.network.mask.copy_(mask)
     return Trained(module, artifact, run, tuple(network["allowed"] or known))
 

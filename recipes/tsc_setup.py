@@ -278,7 +278,7 @@ def load_discriminator(run: Path, wanted: bool) -> tuple[Discriminator | None, t
         normalizer=FeatureNormalizer(torch.zeros(size), torch.ones(size)),
         num_skills=network["num_skills"],
     )
-    discriminator.load_state_dict(artifact.state)
+    artifact.fill(discriminator)
     return discriminator.requires_grad_(False), tuple(network["offsets"])
 
 

@@ -94,7 +94,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
 def begin(parts: Components, cfg: Config) -> None:
     """Where a new run starts from: another run's teacher, a copied script, or the one corrected by the other."""
     if cfg.init_from is not None:
-        parts.teacher.load_state_dict(Artifact.load(cfg.init_from, kind="teacher").state)
+        Artifact.load(cfg.init_from, kind="teacher").fill(parts.teacher)
         deviation = parts.teacher.actor.network.parameters_head.std.data
         deviation.clamp_(max=cfg.ppo.initial_std)
     if copies(cfg):

@@ -20,7 +20,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
-from torch import Tensor
+from torch import Tensor, nn
 
 import agility_rl
 from agility_rl.go2 import constants, features
@@ -180,6 +180,21 @@ class Artifact:
             known = sorted({name.split(".")[0] for name in self.state})
             raise ArtifactError(f"{self.folder} has no part {prefix!r}; it has {', '.join(known)}")
         return found
+
+    def fill(self, module: nn.Module) -> None:
+        """Load the weights into a module.
+
+        Raises:
+            ArtifactError: if they are those of another network; the module may then hold some of them.
+
+        Example:
+            >>> Artifact({"weight": torch.ones(1, 2)}, {}, Path("mine")).fill(nn.Linear(2, 1, bias=False))
+        """
+        try:
+            module.load_state_dict(self.state)
+        except RuntimeError as error:
+            what = " ".join(str(error).split())
+            raise ArtifactError(f"{self.folder}: the weights are not those of the expected network: {what}") from error
 
     def check_layout(self, name: str, layout: Iterable[Sequence[Any]]) -> None:
         """Compare one observation's layout with the layout that the running code would feed.

@@ -87,10 +87,7 @@ def torch_network(artifact: Artifact) -> BBCNetwork:
     artifact.check_layout(keys.PROPRIOCEPTION, features.PROPRIOCEPTION_LAYOUT)
     artifact.check_layout(keys.EXPLICIT, features.EXPLICIT_LAYOUT)
     bbc = BasicBehaviourController(**artifact.manifest["network"])
-    try:
-        bbc.load_state_dict(artifact.state)
-    except RuntimeError as error:
-        raise ArtifactError(f"{artifact.folder}: the weights are not those of the network it names: {error}") from error
+    artifact.fill(bbc)
     return BBCNetwork(bbc.eval().requires_grad_(False))
 
 

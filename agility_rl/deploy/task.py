@@ -191,10 +191,7 @@ def torch_student(artifact: Artifact) -> StudentNetwork:
     """
     check_student(artifact)
     student = RecurrentStudent(**artifact.manifest["network"])
-    try:
-        student.load_state_dict(artifact.state)
-    except RuntimeError as error:
-        raise ArtifactError(f"{artifact.folder}: the weights are not those of the network it names: {error}") from error
+    artifact.fill(student)
     return StudentNetwork(student.eval().requires_grad_(False))
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch import nn
 
 from agility_rl.deploy.artifact import REQUIRED, Artifact, ArtifactError, build_manifest, describe_layout
 from agility_rl.go2 import constants
@@ -227,3 +228,13 @@ def test_the_observation_layout_is_compared(tmp_path: Path, manifest: dict[str, 
         artifact.check_layout("proprioception", LAYOUT[:1])
     with pytest.raises(ArtifactError, match="expects no observation 'depth', only proprioception"):
         artifact.check_layout("depth", LAYOUT)
+
+
+def test_weights_fill_a_module_or_are_refused_in_one_line(tmp_path: Path) -> None:
+    module, weight = nn.Linear(2, 1, bias=False), torch.tensor([[3.0, 4.0]])
+    Artifact({"weight": weight}, {}, tmp_path).fill(module)
+    assert torch.equal(module.weight, weight)
+    for state in ({"weight": torch.ones(1, 3)}, {"other": weight}):
+        with pytest.raises(ArtifactError, match="the weights are not those of the expected network") as caught:
+            Artifact(state, {}, tmp_path).fill(module)
+        assert str(tmp_path) in str(caught.value) and "\n" not in str(caught.value)

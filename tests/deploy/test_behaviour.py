@@ -130,7 +130,7 @@ def test_artifacts_of_another_kind_or_layout_are_refused(artifact: Artifact) -> 
     turned = {**observed, "proprioception": observed["proprioception"][::-1]}
     with pytest.raises(ArtifactError, match="'proprioception' entry 0: the controller was trained with"):
         torch_network(replace(artifact, manifest={**artifact.manifest, "observations": turned}))
-    with pytest.raises(ArtifactError, match="the weights are not those of the network it names"):
+    with pytest.raises(ArtifactError, match="the weights are not those of the expected network"):
         torch_network(replace(artifact, manifest={**artifact.manifest, "network": {"hidden": [8]}}))
     with pytest.raises(ArtifactError, match="has no ONNX file beside the manifest"):
         onnx_network(artifact)

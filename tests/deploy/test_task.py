@@ -177,7 +177,7 @@ def test_what_does_not_fit_is_refused(save: Callable[..., Artifact], artifact: A
     with pytest.raises(ArtifactError, match="was trained on the BBC other, but the robot runs"):
         deployed_student(save(bbc="other"), artifact, StillImage(1.0))
     good = save()
-    with pytest.raises(ArtifactError, match="not those of the network it names"):
+    with pytest.raises(ArtifactError, match="not those of the expected network"):
         torch_student(replace(good, manifest=good.manifest | {"network": good.manifest["network"] | {"memory": 8}}))
 
 
