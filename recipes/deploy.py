@@ -30,20 +30,17 @@ from typing import Annotated, Literal, cast
 import torch
 import tyro
 from controls import ByHand, ControlsConfig, make_device
+from deployed_policy import PolicyConfig, load_camera, standing
 from robot_line import RobotConfig, connect
 from run_record import Recorder
-from task_policy import TaskConfig, load_camera, standing
 
 from agility_rl.deploy import (
-    Artifact,
     BehaviourCommand,
     Controller,
-    DeployedBBC,
     DeployedStudent,
     Mode,
     SafetyLimits,
 )
-from agility_rl.deploy.behaviour import onnx_network, torch_network
 from agility_rl.deploy.controller import StepRecord
 from agility_rl.deploy.deadlines import Clock, Durations, MonotonicClock
 from agility_rl.deploy.depth import DepthSource
@@ -64,7 +61,7 @@ READY_SECONDS = 0.5
 
 
 @dataclass(frozen=True)
-class Config(RobotConfig, ControlsConfig, TaskConfig):
+class Config(RobotConfig, ControlsConfig, PolicyConfig):
     artifact: Annotated[Path, tyro.conf.Positional]
     """Artifact folder of a BBC, or a run with one."""
     operator: Literal["script", "browser", "terminal", "gamepad"] = "script"
@@ -131,13 +128,6 @@ def free_file(folder: Path) -> Path:
     return folder / f"deploy_{number}.mcap"
 
 
-def load(cfg: Config) -> tuple[Artifact, DeployedBBC]:
-    """The controller, ready to run."""
-    artifact = Artifact.load(cfg.artifact, kind="bbc")
-    network = onnx_network(artifact) if cfg.backend == "onnx" else torch_network(artifact)
-    return artifact, DeployedBBC(network, artifact)
-
-
 def summary(controller: Controller, lost: float | None, started: float) -> str:
     """What the loop did, in lines."""
 
@@ -165,7 +155,7 @@ def summary(controller: Controller, lost: float | None, started: float) -> str:
 def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[Path, Controller]:
     """Run, record, print what happened."""
     command = BehaviourCommand.of(cfg.skill, velocity_x=cfg.speed, yaw_rate=cfg.yaw_rate, height=cfg.height)
-    artifact, bbc = load(cfg)
+    bbc = cfg.controller(cfg.artifact)
     path = free_file(Path("runs") / "deploy") if cfg.output is None else cfg.output
     if path.suffix != ".mcap" or path.exists():
         raise ValueError(f"expected --output to be a new file that ends in .mcap, got {path}")
@@ -175,15 +165,17 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
             "a student looks by a camera: the simulated robot of --transport mujoco has one, for any other give "
             "--camera MODULE:NAME (docs/deployment.md)"
         )
+    if cfg.task is None and cfg.camera is not None:
+        raise ValueError("expected --camera only with --task: nothing else looks")
     own_camera = load_camera(cfg.camera) if cfg.camera else None
-    robot_options = {} if cfg.real else cfg.options(artifact.manifest)
+    robot_options = {} if cfg.real else cfg.options(bbc.manifest)
     metadata = {
-        "weights": artifact.manifest["weights"]["sha256"],
+        "weights": bbc.manifest["weights"]["sha256"],
         "robot": {"transport": cfg.transport, "real": cfg.real, **robot_options},
         "versions": cli.versions(),
     }
     limits = SafetyLimits.from_manifest(
-        artifact.manifest,
+        bbc.manifest,
         state_age=cfg.state_age,
         source_age={"operator": cfg.operator_age, "depth": cfg.depth_age},
         missed_deadlines=cfg.missed_deadlines,
@@ -197,7 +189,7 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
         transport, robot = stack.enter_context(connect(cfg, robot_options, simulated_camera))
         episode = stack.enter_context(EpisodeRecorder(path, dt=bbc.period, metadata=metadata))
         started = clock.now()
-        policy = cfg.policy(
+        policy = cfg.commander(
             bbc, own_camera or cast(DepthSource, transport), command if device is None else standing(), started
         )
         control = SharedControl(policy, started)

@@ -45,10 +45,9 @@ from agility_rl.go2 import features
 from agility_rl.modules import RecurrentStudent
 from agility_rl.training import cli
 
-SAME_NETWORK = 1e-6
-"""Largest difference of an output between the training policy and the deployed network, both by PyTorch."""
 SAME_ANSWER = 1e-5
-"""Largest difference of an output between PyTorch and onnxruntime."""
+"""Largest difference of an output between the training policy and the deployed network, and between that by PyTorch and
+by onnxruntime: float32 sums of a batch and of one row, or of two libraries, are rounded differently."""
 _WRITTEN_ANEW = ("format", "format_version", "weights", "onnx", CHECKSUM, "limits", "normalisers")
 
 
@@ -195,10 +194,10 @@ def check_network(export: Exportable) -> tuple[Tensor, ...]:
     rows = [export.network(*(values[index : index + 1] for values in export.seen)) for index in range(export.size)]
     answers = tuple(torch.cat(column) for column in zip(*rows, strict=True))
     worst = difference(answers, export.expected)
-    if not worst <= SAME_NETWORK:
+    if not worst <= SAME_ANSWER:
         raise ArtifactError(
             f"{export.artifact.folder}: the network for deployment differs from the training policy by {worst:.2e}, "
-            f"expected at most {SAME_NETWORK:.0e}; nothing was exported"
+            f"expected at most {SAME_ANSWER:.0e}; nothing was exported"
         )
     return answers
 
@@ -233,6 +232,7 @@ def main(cfg: Config) -> Path:
     """Export, check, write; returns the folder."""
     if cfg.steps < 1:
         raise ValueError(f"expected --steps of at least 1, got {cfg.steps}")
+    torch.set_num_threads(1)  # a few robots: threads would only wait for each other
     export = student_to_export(cfg) if kind_of(cfg.run) == "student" else controller_to_export(cfg)
     source = export.artifact
     output = source.folder if cfg.output is None else cfg.output

@@ -28,10 +28,9 @@ import mujoco
 import torch
 import tyro
 from controls import ControlsConfig, make_device
-from task_policy import TaskConfig, standing
+from deployed_policy import PolicyConfig, standing
 
-from agility_rl.deploy import Artifact, Controller, DeployedBBC, Mode, SafetyLimits
-from agility_rl.deploy.behaviour import onnx_network, torch_network
+from agility_rl.deploy import Controller, Mode, SafetyLimits
 from agility_rl.deploy.controller import StepRecord
 from agility_rl.deploy.operator import Operation, SharedControl
 from agility_rl.deploy.simulated import SimulatedBus, SimulatedRobot
@@ -47,7 +46,7 @@ MOST_BEHIND = 0.1
 
 
 @dataclass(frozen=True)
-class Config(ControlsConfig, TaskConfig):
+class Config(ControlsConfig, PolicyConfig):
     artifact: Annotated[Path, tyro.conf.Positional] = SHIPPED
     """Artifact folder of a BBC, or a run with one."""
     operator: Literal["browser", "terminal", "gamepad"] = "browser"
@@ -104,12 +103,6 @@ class Start:
             controller.request(self._left.pop(0))
 
 
-def load(cfg: Config) -> DeployedBBC:
-    """The controller, ready to run."""
-    artifact = Artifact.load(cfg.artifact, kind="bbc")
-    return DeployedBBC(onnx_network(artifact) if cfg.backend == "onnx" else torch_network(artifact), artifact)
-
-
 def surroundings(cfg: Config) -> Callable[[mujoco.MjSpec], object]:
     """What stands around the robot, and how all of it looks."""
     if cfg.course is None:
@@ -127,14 +120,14 @@ def surroundings(cfg: Config) -> Callable[[mujoco.MjSpec], object]:
 
 def play(cfg: Config, interrupted: Callable[[], bool]) -> Controller:
     """Until interrupted, or for some simulated time."""
-    bbc = load(cfg)
+    bbc = cfg.controller(cfg.artifact)
     friction = bbc.manifest.get("simulation", {}).get("friction_loss", 0.0)
     robot = SimulatedRobot(friction_loss=friction, skin=cfg.skin, surround=surroundings(cfg))
     robot.reset(cfg.pose)
     keys = {PUT_BACK.capitalize(): "back to the start"}
     with contextlib.closing(make_device(cfg.operator, cfg, lambda: robot.model, keys)) as device:
         bus = RealTimeBus(robot)
-        policy = cfg.policy(bbc, SimulatedCamera(robot, now=bus.now), standing(), bus.now())
+        policy = cfg.commander(bbc, SimulatedCamera(robot, now=bus.now), standing(), bus.now())
         control = SharedControl(policy, bus.now())
         # Nobody is hurt by a simulated robot whose operator looks away.
         ages = {**SafetyLimits().source_age, "operator": math.inf}

@@ -13,8 +13,10 @@ from agility_rl.deploy.dds import DOMAIN, DDSTransport
 from agility_rl.deploy.lcm import LCMTransport, address
 from agility_rl.deploy.loopback import LoopbackTransport
 from agility_rl.deploy.robot_process import RobotProcess
+from agility_rl.deploy.simulated import add_world
 from agility_rl.deploy.transport import Transport
 from agility_rl.deploy.unitree_messages import FootCalibration
+from agility_rl.go2.model import build_spec
 
 CONNECT_SECONDS = 60.0
 """Time to wait for the robot's first state [s]."""
@@ -59,7 +61,7 @@ class RobotConfig:
         """Refuse options of another transport.
 
         Raises:
-            ValueError: naming the option.
+            ValueError: naming the option, or a world that is no MJCF file.
         """
         for option, transport in {"interface": "dds", "ttl": "lcm"}.items():
             if getattr(self, option) and self.transport != transport:
@@ -71,6 +73,8 @@ class RobotConfig:
                 raise ValueError(f"expected --{option} only with a simulated robot, got a real one")
         if self.course is not None and self.world is not None:
             raise ValueError("expected --course or --world, got both")
+        if self.world is not None:
+            add_world(self.world)(build_spec())
 
     def options(self, manifest: Mapping[str, Any]) -> dict[str, Any]:
         """The simulated robot, for :class:`agility_rl.deploy.robot_process.RobotProcess`."""

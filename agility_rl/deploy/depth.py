@@ -184,14 +184,6 @@ def _sort(samples: np.ndarray) -> None:
         lower[...] = nearer
 
 
-def _opencv() -> ModuleType:
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImportError("depth images need OpenCV: pip install 'agility_rl[video]'") from error
-    return cv2
-
-
 def sensor_image(counts: np.ndarray) -> np.ndarray:
     """Camera image of which :func:`downsample` makes ``counts``: each pixel as a block, nothing around the crop.
 
@@ -218,3 +210,11 @@ def sensor_image(counts: np.ndarray) -> np.ndarray:
     columns = slice(_FIRST[1], _FIRST[1] + size * _SIZE[1])
     image[rows, columns] = np.repeat(np.repeat(counts, size, 0), size, 1)
     return image
+
+
+def _opencv() -> ModuleType:
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError("depth images need OpenCV: pip install 'agility_rl[deploy]'") from error
+    return cv2

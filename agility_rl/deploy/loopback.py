@@ -1,8 +1,8 @@
 """States and commands as UDP packets on this machine: how the controller talks to a simulator in another process.
 
-Every packet ends with a CRC-32. A robot with a camera sends its depths along, one number for each pixel of the network.
-Whoever has sent a command or a greeting gets states. The robot answers a greeting with
-the names of its joints, and says in every state how many programs have lately commanded it.
+Every packet ends with a CRC-32. Whoever has sent a command or a greeting gets states. The robot answers a greeting with
+the names of its joints, and says in every state how many programs have lately commanded it. One with a camera sends its
+depths along, one number for each pixel of the network.
 """
 
 from __future__ import annotations

@@ -29,7 +29,8 @@ OUTPUTS = ("logits", "parameters", "heading", "obstacle", "memory")
 class StudentNetwork(nn.Module):
     """One step of a student as one plain network, without TensorDicts: for the robot.
 
-    Computes what ``student.policy()`` computes with deterministic actions, after the first step of an episode.
+    Computes what ``student.policy()`` does with deterministic actions; the memory goes in and comes out, and an episode
+    begins with zeros.
 
     Source: supplement S6.
 
@@ -99,7 +100,7 @@ class DeployedStudent:
     Example:
         >>> import tempfile
         >>> from agility_rl.deploy.artifact import build_manifest
-        >>> from agility_rl.deploy.depth import Frame, StillImage
+        >>> from agility_rl.deploy.depth import StillImage
         >>> from agility_rl.deploy.transport import RobotState
         >>> student = RecurrentStudent(memory=16, hidden=(8,), encoder_hidden=8)
         >>> manifest = build_manifest("student", features.CONTROLLER_LAYOUTS, control_period=0.1,
@@ -167,7 +168,7 @@ class DeployedStudent:
         )
         self.heading, self.obstacle = heading[0], int(obstacle[0].argmax())
         skill = logits.argmax(-1)
-        command, shift = behaviours.commands_from_parameters(skill, parameters[:, int(skill)].clamp(-1.0, 1.0))
+        command, shift = behaviours.commands_from_parameters(skill, parameters[:, int(skill)])
         return BehaviourCommand(int(skill), command[0], float(shift[0]))
 
     def sources(self) -> Mapping[str, float]:

@@ -166,5 +166,5 @@ def test_what_is_no_image(preprocess: DepthPreprocessor, image: np.ndarray, mess
 
 def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(ImportError, match=r"agility_rl\[video\]"):
+    with pytest.raises(ImportError, match=r"agility_rl\[deploy\]"):
         DepthPreprocessor()

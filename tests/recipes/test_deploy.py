@@ -127,6 +127,8 @@ def test_a_student_needs_a_camera(
     student = make_student()
     with pytest.raises(ValueError, match="a student looks by a camera: the simulated robot of"):
         deploy.main(deploy.Config(untrained, task=student, transport="dds", output=tmp_path / "run.mcap"))
+    with pytest.raises(ValueError, match="expected --camera only with --task: nothing else looks"):
+        deploy.main(deploy.Config(untrained, camera="mine:Eye", output=tmp_path / "run.mcap"))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text("class Blind: ...\nclass Eye:\n    def latest(self): return None\n")
     load_camera = deploy.load_camera
@@ -153,6 +155,17 @@ def test_an_option_of_another_transport_is_named(deploy: ModuleType, untrained: 
             deploy.main(deploy.Config(untrained, output=tmp_path / "run.mcap", **options))
 
 
+def test_a_world_that_is_none_is_refused_before_the_robot_starts(
+    deploy: ModuleType, untrained: Path, tmp_path: Path
+) -> None:
+    bad = tmp_path / "world.xml"
+    bad.write_text("<mujoco><worldbody><geom type='sponge'/></worldbody></mujoco>")
+    for file in (bad, tmp_path / "missing.xml"):
+        with pytest.raises(ValueError, match=f"{file.name}: expected an MJCF file of what stands around the robot"):
+            deploy.main(deploy.Config(untrained, world=file, output=tmp_path / "run.mcap"))
+    assert not (tmp_path / "run.mcap").exists()
+
+
 def test_a_file_is_never_overwritten_and_a_bad_name_is_named(
     deploy: ModuleType, untrained: Path, tmp_path: Path
 ) -> None:
@@ -167,7 +180,7 @@ def test_a_file_is_never_overwritten_and_a_bad_name_is_named(
 
 
 def test_what_a_row_holds(deploy: ModuleType, untrained: Path, tmp_path: Path) -> None:
-    _, bbc = deploy.load(deploy.Config(untrained))
+    bbc = deploy.Config(untrained).controller(untrained)
     state = replace(RobotState.standing(time=1.0), joint_velocity=torch.arange(12.0), foot_force=torch.zeros(4))
     hold = JointCommand(bbc.target(torch.full((12,), 0.5)), bbc.stiffness, bbc.damping)
     standing = StepRecord(1.01, Mode.STAND_UP, state, hold, None, None, None, False, 0.001, 0.0)

@@ -30,7 +30,7 @@ def shipped(repository: Path) -> Path:
 def deployed(module: Module, artifact: Path, path: Path, seconds: float) -> tuple[Controller, SimulatedBus]:
     """What ``deploy.py`` does, without waiting for real time: a soft robot trots, and everything is recorded."""
     deploy = module("deploy")
-    _, bbc = deploy.load(deploy.Config(artifact))
+    bbc = deploy.Config(artifact).controller(artifact)
     factors = [SOFT[link] for _ in constants.LEGS for link in constants.LINKS]
     bus = SimulatedBus(SimulatedRobot(sim_dt=constants.SIM_DT, friction_loss=0.0, stiffness_factor=factors))
     bus.robot.reset("lying")

@@ -1,4 +1,4 @@
-"""Who decides where a person does not, for ``play.py`` and ``deploy.py``: a student that looks, or nobody."""
+"""The controller of ``play.py`` and ``deploy.py``, and who decides where a person does not: a student, or nobody."""
 
 from __future__ import annotations
 
@@ -9,20 +9,31 @@ from pathlib import Path
 from typing import Any, Literal
 
 from agility_rl.deploy import Artifact, BehaviourCommand, DeployedBBC, DeployedStudent, Operator
+from agility_rl.deploy.behaviour import onnx_network, torch_network
 from agility_rl.deploy.commander import Commander
 from agility_rl.deploy.depth import DepthSource
 from agility_rl.deploy.task import onnx_student, torch_student
 
 
 @dataclass(frozen=True, kw_only=True)
-class TaskConfig:
+class PolicyConfig:
     task: Path | None = None
     """Run or artifact folder of a student (tsc_student.py), which then decides by depth images; the controller must be
     the one that it was trained on."""
     backend: Literal["torch", "onnx"] = "torch"
     """What computes the networks; onnx needs exported artifacts and onnxruntime."""
 
-    def policy(self, bbc: DeployedBBC, eyes: DepthSource, otherwise: BehaviourCommand, now: float) -> Commander:
+    def controller(self, folder: Path) -> DeployedBBC:
+        """The Basic Behaviour Controller, ready to run.
+
+        Raises:
+            ArtifactError: if the folder has none, or none that the backend can compute.
+        """
+        artifact = Artifact.load(folder, kind="bbc")
+        network = onnx_network(artifact) if self.backend == "onnx" else torch_network(artifact)
+        return DeployedBBC(network, artifact)
+
+    def commander(self, bbc: DeployedBBC, eyes: DepthSource, otherwise: BehaviourCommand, now: float) -> Commander:
         """The student, or a constant command.
 
         Raises:
