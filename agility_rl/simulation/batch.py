@@ -14,11 +14,12 @@ from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
 from agility_rl.go2 import constants
-from agility_rl.go2.model import ROBOT_GROUP, build_spec
+from agility_rl.go2.model import ROBOT_GROUP
 from agility_rl.simulation.depth_camera import DepthCamera
-from agility_rl.simulation.scenery import Piece, add_scenery, hinge_name
-from agility_rl.simulation.simulator import PARAMETERS
+from agility_rl.simulation.parameters import SimulationParameters
+from agility_rl.simulation.scenery import Piece
 from agility_rl.simulation.terrain import HeightField
+from agility_rl.simulation.world import FORCES, JOINT_SPEEDS, JOINTS, World
 
 _WARNINGS = [
     int(warning)
@@ -29,16 +30,6 @@ _WARNINGS = [
         mujoco.mjtWarning.mjWARN_BADCTRL,
     )
 ]
-# The robot is the model's first tree, and its contact forces are the first sensors; scenery comes behind.
-_JOINTS, _JOINT_SPEEDS = slice(7, 7 + constants.NUM_JOINTS), slice(6, 6 + constants.NUM_JOINTS)
-_FORCES = slice(0, 3 * len(constants.CONTACT_GROUPS))
-_TERRAIN_MARGIN = 2.0
-"""Robots start at least this far from the edge of a height field [m]."""
-_FLAT = {
-    "joint_damping": ("dof_damping", _JOINT_SPEEDS),
-    "armature": ("dof_armature", _JOINT_SPEEDS),
-    "friction_loss": ("dof_frictionloss", _JOINT_SPEEDS),
-}
 
 
 class BatchSimulator:
@@ -77,42 +68,28 @@ class BatchSimulator:
         scenery: Sequence[Piece] = (),
         **model_options: Any,
     ) -> None:
-        substeps = control_dt / sim_dt
         if num_simulations < 1:
             raise ValueError(f"num_simulations must be at least 1, got {num_simulations}")
-        if abs(substeps - round(substeps)) > 1e-6 or round(substeps) < 1:
-            raise ValueError(f"control_dt must be a multiple of sim_dt, got {control_dt} and {sim_dt} s")
         self.num_simulations = num_simulations
         self.num_threads = num_threads or len(os.sched_getaffinity(0))
-        self.control_dt, self.sim_dt, self.substeps = control_dt, sim_dt, round(substeps)
-        self.terrain = terrain
-        self.ground_extent = 0.0 if terrain is None else min(terrain.half_size) - _TERRAIN_MARGIN
-        if terrain is not None:
-            model_options |= {"heights": terrain.heights.numpy(), "height_field_size": terrain.half_size}
-        self.scenery: Sequence[Piece] = tuple(scenery)
-        spec = build_spec(sim_dt=sim_dt, **model_options)
-        add_scenery(spec, self.scenery)
-        self._spec = spec
-        self.model: mujoco.MjModel = spec.compile()
+        self.world = World(control_dt=control_dt, sim_dt=sim_dt, terrain=terrain, scenery=scenery, **model_options)
+        self.control_dt, self.sim_dt, self.substeps = control_dt, sim_dt, self.world.substeps
+        self.terrain, self.ground_extent = terrain, self.world.ground_extent
+        self.scenery: Sequence[Piece] = self.world.scenery
+        self.model: mujoco.MjModel = self.world.model
         self.batch = Batch(self.model, num_simulations, self.num_threads)
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._ctrl, self._sensordata = self.batch.bind("ctrl"), self.batch.bind("sensordata")
         if self.scenery:
             self._mocap_position, self._mocap_quaternion = self.batch.bind("mocap_pos"), self.batch.bind("mocap_quat")
-        hinges = [self.model.joint(hinge_name(piece)) for piece in self.scenery if piece.hinge is not None]
-        self._hinges = [int(joint.qposadr[0]) for joint in hinges]
-        self._hinge_speeds = [int(joint.dofadr[0]) for joint in hinges]
-        bodies = {name for piece in self.scenery for name in (piece.name, f"{piece.name}/moving")}
-        geoms = (self.model.geom(index) for index in range(self.model.ngeom))
-        self._ground = np.array(
-            [geom.id for geom in geoms if geom.name == "floor" or self.model.body(geom.bodyid[0]).name in bodies]
+        self._hinges, self._hinge_speeds = self.world.hinges, self.world.hinge_speeds
+        self._parameters = SimulationParameters(
+            self.world, num_simulations, lambda field: torch.from_numpy(self.batch.expand(field))
         )
-        self._parameters: dict[str, Tensor] = {}
-        self._delay_steps: Tensor | None = None
         self._previous_target = torch.tensor(constants.DEFAULT_POSE).repeat(num_simulations, 1)
         self._warned = self._warning_count()
         self.unstable = torch.zeros(num_simulations, dtype=torch.bool)
-        self._qpos[:, _JOINTS] = self._ctrl[:] = constants.DEFAULT_POSE
+        self._qpos[:, JOINTS] = self._ctrl[:] = constants.DEFAULT_POSE
         self.batch.forward()
         self._read()
 
@@ -127,7 +104,7 @@ class BatchSimulator:
                 f"target must be [{self.num_simulations}, {constants.NUM_JOINTS}], got {list(target.shape)}"
             )
         failed: list[int] = []
-        if self._delay_steps is None:
+        if self._parameters.delay is None:
             self._ctrl[:] = target.numpy()
             failed += self._advance(self.substeps)
         else:
@@ -149,9 +126,9 @@ class BatchSimulator:
 
     def _step_delayed(self, target: Tensor) -> list[int]:
         """Step one physics step at a time; each simulation takes its new target after its own delay."""
-        assert self._delay_steps is not None
+        assert self._parameters.delay is not None
         new, old = target.numpy(), self._previous_target.numpy()
-        delay = self._delay_steps.numpy()
+        delay = self._parameters.delay.numpy()
         edges = sorted({0, self.substeps, *np.unique(delay[delay < self.substeps]).tolist()})
         failed: list[int] = []
         for start, end in pairwise(edges):
@@ -192,7 +169,7 @@ class BatchSimulator:
         if placed is not None:
             self._mocap_position[ids], self._mocap_quaternion[ids] = placed
         state, speed = self._qpos[ids], self._qvel[ids]
-        state[:, : _JOINTS.stop], speed[:, : _JOINT_SPEEDS.stop] = qpos.numpy(), qvel.numpy()
+        state[:, : JOINTS.stop], speed[:, : JOINT_SPEEDS.stop] = qpos.numpy(), qvel.numpy()
         state[:, self._hinges], speed[:, self._hinge_speeds] = angle, rate
         self._qpos[ids], self._qvel[ids] = state, speed
         self._ctrl[ids] = joint_position[mask].numpy()
@@ -214,16 +191,9 @@ class BatchSimulator:
         Raises:
             ValueError: if a shape is another or a number is not finite.
         """
-        n, pieces = self.num_simulations, len(self.scenery)
-        expected = {"position": (n, pieces, 3), "quaternion": (n, pieces, 4), "hinge_angle": (n, len(self._hinges))}
-        given = {"position": position, "quaternion": quaternion, "hinge_angle": hinge_angle}
-        for name, value in given.items():
-            if tuple(value.shape) != expected[name]:
-                raise ValueError(f"{name} of the scenery must be {list(expected[name])}, got {list(value.shape)}")
-            if not bool(torch.isfinite(value[mask]).all()):
-                raise ValueError(f"{name} of the scenery is not finite; look for NaN in what it comes from")
+        self.world.check_places(mask, position, quaternion, hinge_angle)
         ids = mask.numpy()
-        if not pieces or not ids.any():
+        if not self.scenery or not ids.any():
             return
         self._mocap_position[ids], self._mocap_quaternion[ids] = position[mask].numpy(), quaternion[mask].numpy()
         state, speed = self._qpos[ids], self._qvel[ids]
@@ -235,11 +205,11 @@ class BatchSimulator:
     def _read(self) -> None:
         qpos = torch.from_numpy(self._qpos.astype(np.float32))
         qvel = torch.from_numpy(self._qvel.astype(np.float32))
-        self.root_position, self.root_quaternion, self.joint_position = qpos[:, :3], qpos[:, 3:7], qpos[:, _JOINTS]
+        self.root_position, self.root_quaternion, self.joint_position = qpos[:, :3], qpos[:, 3:7], qpos[:, JOINTS]
         self.root_linear_velocity, self.root_angular_velocity = qvel[:, :3], qvel[:, 3:6]
-        self.joint_velocity = qvel[:, _JOINT_SPEEDS]
+        self.joint_velocity = qvel[:, JOINT_SPEEDS]
         self.hinge_angle = qpos[:, self._hinges]
-        forces = torch.from_numpy(self._sensordata[:, _FORCES].astype(np.float32))
+        forces = torch.from_numpy(self._sensordata[:, FORCES].astype(np.float32))
         self.contact_force = torch.linalg.vector_norm(forces.unflatten(-1, (-1, 3)), dim=-1)
 
     def _warning_count(self) -> np.ndarray:
@@ -251,68 +221,12 @@ class BatchSimulator:
         Raises:
             ValueError: if a parameter is unknown or has a wrong shape.
         """
-        rows = mask.numpy()
-        for name, value in fields.items():
-            if name not in PARAMETERS:
-                raise ValueError(f"unknown parameter {name!r}; expected one of {', '.join(PARAMETERS)}")
-            shape = (self.num_simulations, PARAMETERS[name][0])
-            if tuple(value.shape) != shape:
-                raise ValueError(f"{name} must be {list(shape)}, got {list(value.shape)}")
-            self._parameters[name] = torch.where(mask[:, None], value.float(), self.parameter(name))
-            self._write(name, rows, self._parameters[name])
-        if rows.any() and {"trunk_mass_offset", "trunk_com_offset", "armature"} & set(fields):
-            self.batch.set_const(rows)
+        if self._parameters.set(mask, fields) and bool(mask.any()):
+            self.batch.set_const(mask.numpy())
 
     def parameter(self, name: str) -> Tensor:
         """Present value ``[N, size]`` of a parameter, as a copy."""
-        return self._parameters[name].clone() if name in self._parameters else self._nominal(name)
-
-    def _nominal(self, name: str) -> Tensor:
-        """Value ``[N, size]`` of a parameter in the model as it was compiled."""
-        model, size = self.model, PARAMETERS[name][0]
-        if name in _FLAT:
-            field, part = _FLAT[name]
-            value = getattr(model, field)[part]
-        elif name == "stiffness":
-            value = model.actuator_gainprm[:, 0]
-        elif name == "damping":
-            value = -model.actuator_biasprm[:, 2]
-        elif name == "torque_limit":
-            value = model.actuator_forcerange[:, 1]
-        elif name == "ground_friction":
-            value = model.geom("floor").friction[:1]
-        else:  # offsets and the delay
-            value = np.zeros(size)
-        return torch.as_tensor(np.array(value), dtype=torch.float32).reshape(1, size).repeat(self.num_simulations, 1)
-
-    def _write(self, name: str, rows: np.ndarray, value: Tensor) -> None:
-        batch, model = self.batch, self.model
-        new = value.numpy()[rows]
-        trunk = model.body("trunk").id
-        if name == "stiffness":
-            batch.expand("actuator_gainprm")[rows, :, 0] = new
-            batch.expand("actuator_biasprm")[rows, :, 1] = -new
-        elif name == "damping":
-            batch.expand("actuator_biasprm")[rows, :, 2] = -new
-        elif name == "torque_limit":
-            batch.expand("actuator_forcerange")[rows] = np.stack((-new, new), -1)
-        elif name == "ground_friction":
-            batch.expand("geom_friction")[np.ix_(rows, self._ground, np.array([0]))] = new[:, None]
-        elif name == "trunk_mass_offset":
-            nominal = model.body_mass[trunk]
-            mass = nominal + new[:, 0]
-            batch.expand("body_mass")[rows, trunk] = mass
-            batch.expand("body_inertia")[rows, trunk] = model.body_inertia[trunk] * (mass / nominal)[:, None]
-        elif name == "trunk_com_offset":
-            batch.expand("body_ipos")[rows, trunk] = model.body_ipos[trunk] + new
-        elif name == "action_delay":
-            steps = (value[:, 0] / self.sim_dt).round().long()
-            if bool((steps > self.substeps).any()):
-                raise ValueError(f"action_delay must be at most one control step, {self.control_dt} s")
-            self._delay_steps = steps if bool(steps.any()) else None
-        else:
-            field, part = _FLAT[name]
-            batch.expand(field)[rows, part] = new
+        return self._parameters.value(name)
 
     def push(self, mask: Tensor, velocity: Tensor) -> None:
         """Set the horizontal trunk velocity ``[N, 2]`` [m/s] of the rows of a bool mask."""
@@ -334,13 +248,13 @@ class BatchSimulator:
 
     def make_camera(self) -> DepthCamera:
         """A depth camera on every robot, which follows these simulations."""
-        return DepthCamera(self._spec, self.batch, self.num_threads)
+        return DepthCamera(self.world.spec, self.batch, self.num_threads)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything an exact continuation needs: integration states, parameters, derived fields last read."""
         return {
             "state": torch.from_numpy(self.batch.state.copy()),
-            "parameters": {name: value.clone() for name, value in self._parameters.items()},
+            "parameters": {name: value.clone() for name, value in self._parameters.values.items()},
             "previous_target": self._previous_target.clone(),
             "contact_force": self.contact_force.clone(),
             "unstable": self.unstable.clone(),
@@ -360,7 +274,7 @@ class BatchSimulator:
             )
         everyone = torch.ones(self.num_simulations, dtype=torch.bool)
         # What was never set in the saved simulation has its nominal value there, whatever it is here.
-        nominal = {name: self._nominal(name) for name in self._parameters}
+        nominal = {name: self._parameters.nominal(name) for name in self._parameters.values}
         self.set_parameters(everyone, **{**nominal, **state["parameters"]})
         self.batch.state[:] = saved
         self._warned = self._warning_count()

@@ -16,9 +16,37 @@ from torch import Tensor
 from agility_rl.go2 import camera
 
 CAMERA = "depth"
-_FORWARD = (0.5, 0.5, -0.5, -0.5)  # looks along +x of the trunk, image right is -y, image up is +z
+FORWARD = (0.5, 0.5, -0.5, -0.5)  # looks along +x of the trunk, image right is -y, image up is +z
 _VISIBLE = {f"{leg}_{part}" for leg in ("FL", "FR") for part in ("thigh", "calf", "shin", "foot")}
 """Shapes of the robot that can come before its camera: all others, whatever the joints, stay behind it."""
+
+
+def camera_spec(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """What the camera of a simulated robot can see, and the camera: no sensors, actuators or contacts.
+
+    Args:
+        spec: model of a simulation; it is copied.
+
+    Example:
+        >>> from agility_rl.go2.model import build_spec
+        >>> [eye.name for eye in camera_spec(build_spec()).cameras]
+        ['depth']
+    """
+    spec = spec.copy()
+    for element in (*spec.sensors, *spec.actuators):
+        spec.delete(element)
+    trunk = spec.body("trunk")
+    for shape in trunk.find_all("geom"):
+        if shape.name in _VISIBLE:
+            shape.rgba = (1.0, 1.0, 1.0, 1.0)  # rays pass through what is transparent, as under a skin
+        else:
+            spec.delete(shape)
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    width, height = camera.IMAGE_WIDTH, camera.IMAGE_HEIGHT
+    eye = trunk.add_camera(name=CAMERA, pos=camera.POSITION, quat=FORWARD)
+    eye.resolution, eye.sensor_size = (width, height), (width * 1e-6, height * 1e-6)
+    eye.focal_pixel, eye.principal_pixel = (camera.FOCAL_LENGTH, camera.FOCAL_LENGTH), camera.PRINCIPAL_POINT
+    return spec
 
 
 class DepthCamera:
@@ -45,20 +73,7 @@ class DepthCamera:
     """
 
     def __init__(self, spec: mujoco.MjSpec, source: Batch, num_threads: int) -> None:
-        spec = spec.copy()
-        for element in (*spec.sensors, *spec.actuators):
-            spec.delete(element)
-        trunk = spec.body("trunk")
-        for shape in trunk.find_all("geom"):
-            if shape.name in _VISIBLE:
-                shape.rgba = (1.0, 1.0, 1.0, 1.0)  # rays pass through what is transparent, as under a skin
-            else:
-                spec.delete(shape)
-        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-        width, height = camera.IMAGE_WIDTH, camera.IMAGE_HEIGHT
-        eye = trunk.add_camera(name=CAMERA, pos=camera.POSITION, quat=_FORWARD)
-        eye.resolution, eye.sensor_size = (width, height), (width * 1e-6, height * 1e-6)
-        eye.focal_pixel, eye.principal_pixel = (camera.FOCAL_LENGTH, camera.FOCAL_LENGTH), camera.PRINCIPAL_POINT
+        spec = camera_spec(spec)
         spec.add_sensor(
             name=CAMERA,
             type=mujoco.mjtSensor.mjSENS_RANGEFINDER,
@@ -80,7 +95,7 @@ class DepthCamera:
         turn = np.stack((np.cos(half), 0.0 * half, np.sin(half), 0.0 * half), -1)
         turned = np.empty((len(half), 4))
         for row, quaternion in zip(turned, turn, strict=True):
-            mujoco.mju_mulQuat(row, quaternion, np.array(_FORWARD))
+            mujoco.mju_mulQuat(row, quaternion, np.array(FORWARD))
         self._batch.expand("cam_quat")[:, self.model.camera(CAMERA).id] = turned
 
     def render(self, mask: Tensor) -> Tensor:

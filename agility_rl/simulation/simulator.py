@@ -154,20 +154,26 @@ def make_simulator(name: str = "batch", *, num_simulations: int, **options: Any)
     """Build a simulator by name.
 
     Args:
-        name: ``"batch"`` (CPU, ``mujoco.batch``).
+        name: ``"batch"`` (CPU, ``mujoco.batch``) or ``"warp"`` (NVIDIA GPU, ``mujoco-warp``: extra ``gpu``), to which
+            ``num_threads`` says nothing.
         num_simulations: N.
         **options: keyword arguments of the simulator's class.
 
     Raises:
         ValueError: if there is no simulator of this name.
+        ImportError: if it is not installed.
 
     Example:
         >>> simulator = make_simulator(num_simulations=2, num_threads=1)
         >>> simulator.root_position.shape
         torch.Size([2, 3])
     """
-    if name != "batch":
-        raise ValueError(f"unknown simulator {name!r}; expected 'batch' (CPU)")
-    from agility_rl.simulation.batch import BatchSimulator
+    if name == "batch":
+        from agility_rl.simulation.batch import BatchSimulator
 
-    return BatchSimulator(num_simulations, **options)
+        return BatchSimulator(num_simulations, **options)
+    if name == "warp":
+        from agility_rl.simulation.warp import WarpSimulator
+
+        return WarpSimulator(num_simulations, **{key: options[key] for key in options if key != "num_threads"})
+    raise ValueError(f"unknown simulator {name!r}; expected 'batch' (CPU) or 'warp' (NVIDIA GPU)")

@@ -146,7 +146,7 @@ def test_rows_of_a_mask_and_the_number_of_threads(generator: torch.Generator) ->
     mask = torch.tensor([False, True, False, True, True])
     assert torch.equal(eye.render(mask), everyone[mask])
     assert eye.render(torch.zeros(5, dtype=torch.bool)).shape == (0, 58, 87)
-    other = DepthCamera(simulator._spec, simulator.batch, num_threads=2)
+    other = DepthCamera(simulator.world.spec, simulator.batch, num_threads=2)
     other.set_pitch(torch.ones(5, dtype=torch.bool), eye.pitch)
     assert torch.equal(other.render(torch.ones(5, dtype=torch.bool)), everyone)
     simulator.close()
