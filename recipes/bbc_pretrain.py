@@ -32,7 +32,8 @@ from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS, COMMANDS
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.losses import functional
-from agility_rl.training import cli
+from agility_rl.training import cli, distributed
+from agility_rl.training.distributed import optimized
 
 HEADLINE: tuple[str, ...] = (
     *("time/minutes", "reward/imitation", "reward/task", "accuracy_expert", "accuracy_policy", "kl"),
@@ -63,8 +64,9 @@ def update_imitation(parts: Components, cfg: ImitationConfig, iteration: int) ->
         )
         parts.imitation_optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        distributed.average_gradients(optimized(parts.imitation_optimizer))
         parts.imitation_optimizer.step()
-        parts.prior.update(recorded_shares(parts, cfg, predicted))
+        parts.prior.update(distributed.average(recorded_shares(parts, cfg, predicted)))
         for name, value in (*discriminated.items(), *predicted.items()):
             if value.numel() == 1:
                 totals[name] = totals.get(name, torch.zeros(())) + value.detach() / cfg.minibatches
@@ -184,7 +186,7 @@ def train(cfg: Config) -> Path:
     return run(
         "bbc_pretrain",
         cfg,
-        build(cfg),
+        build,
         begin=begin,
         iterate=iterate,
         save_policy=save_policy,

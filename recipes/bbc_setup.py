@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from bbc_cloning import Demonstrations
@@ -32,7 +33,6 @@ from agility_rl.modules import (
     SkillPrior,
 )
 from agility_rl.motion import MotionDataset
-from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.ppo import PPOUpdate
 from agility_rl.training.precision import hidden_precision
 from agility_rl.training.rollout import Rollout
@@ -74,11 +74,17 @@ class Components:
         """Source of minibatch order and motion samples."""
         return self.seeds.generator("batches")
 
-    def checkpoint(self, folder: Path, progress: dict[str, float]) -> RunCheckpoint:
-        """All that a bit-exact continuation needs."""
-        names = ("seeds", "env", "bbc", "critic", "discriminator", "predictor", "prior", "replay", "rollout")
+    @property
+    def alike(self) -> dict[str, Any]:
+        """What every process holds alike."""
+        names = ("bbc", "critic", "discriminator", "predictor", "prior")
         names += ("policy_optimizer", "imitation_optimizer", "adaptation_optimizer")
-        return RunCheckpoint(folder, progress=progress, **{name: getattr(self, name) for name in names})
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def own(self) -> dict[str, Any]:
+        """What each process has for itself."""
+        return {name: getattr(self, name) for name in ("seeds", "env", "replay", "rollout")}
 
 
 def build(cfg: Config) -> Components:

@@ -11,6 +11,7 @@ from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.envs import AgilityEnv
 from agility_rl.envs.obstacles import OBSTACLES
+from agility_rl.training import distributed
 
 
 def judge(env: AgilityEnv, curriculum: Curriculum, batch: TensorDictBase) -> dict[str, Tensor | float]:
@@ -20,7 +21,8 @@ def judge(env: AgilityEnv, curriculum: Curriculum, batch: TensorDictBase) -> dic
     episodes, successes = int(done.sum()), int((outcome["success"][..., 0] & done).sum())
     passed = outcome["passed"].flatten(0, 1).sum(0).float()
     failed = (outcome["failed"] | outcome["bypassed"]).flatten(0, 1).sum(0).float()
-    curriculum.update(passed, failed, successes, episodes)
+    counts = distributed.total(torch.tensor([successes, episodes]))
+    curriculum.update(distributed.total(passed), distributed.total(failed), int(counts[0]), int(counts[1]))
     rate = curriculum.passed / (curriculum.passed + curriculum.failed)
     metrics: dict[str, Tensor | float] = {"episodes": float(episodes)}
     if episodes:

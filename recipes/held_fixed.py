@@ -13,6 +13,7 @@ from torchrl.objectives import LossModule
 
 from agility_rl import keys
 from agility_rl.losses import AdaptationLoss
+from agility_rl.training import distributed
 
 INFERRED = "inferred_latent"
 """Latent that the history encoder infers, float32 ``[T, N, 29]``, in collected experience."""
@@ -50,6 +51,7 @@ def fit(
         found = [dict(loss(flat[rows]).items()) for loss in losses]
         optimizer.zero_grad(set_to_none=True)
         torch.stack([result[loss.out_keys[0]] for loss, result in zip(losses, found, strict=True)]).sum().backward()
+        distributed.average_gradients(distributed.optimized(optimizer))
         optimizer.step()
         metrics = {name: value for result in found for name, value in result.items()}
     return {name: value.detach() for name, value in metrics.items() if value.numel() == 1}

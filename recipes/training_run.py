@@ -1,17 +1,23 @@
-"""How a training runs from its folder to its end: checkpoints, log, display, Ctrl-C, time limit."""
+"""How a training runs from its folder to its end: checkpoints, log, display, Ctrl-C, time limit.
+
+Started by ``torchrun --nproc-per-node 2 recipes/...``, every process has the robots of ``--env.num-robots`` for itself;
+all of them train one policy, and the first one writes.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
+from torch import nn
 from torchrl.envs import EnvBase
 
 from agility_rl.record import MCAPLogger
-from agility_rl.training import cli
+from agility_rl.training import cli, distributed
 from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.display import Display
 
@@ -39,8 +45,14 @@ class Parts(Protocol):
     @property
     def env(self) -> EnvBase: ...
 
-    def checkpoint(self, folder: Path, progress: dict[str, float]) -> RunCheckpoint:
-        """All that a bit-exact continuation needs."""
+    @property
+    def alike(self) -> dict[str, Any]:
+        """What every process holds alike: networks, optimisers, curriculum."""
+        ...
+
+    @property
+    def own(self) -> dict[str, Any]:
+        """What each process has for itself: robots, memories, random numbers."""
         ...
 
 
@@ -73,10 +85,45 @@ class Laps:
         self.metrics[f"time/{name}"], self._last = now - self._last, now
 
 
+class SavedRun:
+    """Checkpoints of a run: one of all that is alike and of the first process, one more of each other process.
+
+    With as many processes as wrote it, a run goes on bit for bit; with another number, robots and memories begin anew.
+    """
+
+    def __init__(self, folder: Path, parts: Parts, progress: dict[str, float]) -> None:
+        rank = distributed.rank()
+        self.progress, self._alike = progress, {"progress", *parts.alike}
+        own = parts.own if rank == 0 else {}
+        self._main = RunCheckpoint(folder, progress=progress, **parts.alike, **own)
+        self._own = None if rank == 0 else RunCheckpoint(folder / f"process-{rank}", **parts.own)
+
+    def save(self) -> None:
+        """Write what belongs to this process; the first one's file comes last."""
+        step = int(self.progress["iteration"])
+        self.progress["processes"] = distributed.size()
+        if self._own is not None:
+            self._own.save(step)
+        distributed.wait()
+        if self._own is None:
+            self._main.save(step)
+
+    def load(self) -> None:
+        """Restore the newest checkpoint."""
+        step = self._main.load(components={"progress"})
+        if self.progress.get("processes", 1) != distributed.size():
+            self._main.load(step, components=self._alike)
+        elif self._own is None:
+            self._main.load(step)
+        else:
+            self._main.load(step, components=self._alike)
+            self._own.load(step)
+
+
 def run(
     recipe: str,
     cfg: C,
-    parts: P,
+    build: Callable[[C], P],
     *,
     begin: Callable[[P, C], None],
     iterate: Callable[[P, C, int], dict[str, float]],
@@ -88,7 +135,7 @@ def run(
     Args:
         recipe: its name.
         cfg: its options.
-        parts: what it is made of.
+        build: makes what it is made of.
         begin: called once in a new run, before the first iteration.
         iterate: from the number of finished iterations to the metrics of the next.
         save_policy: writes the artifact into a run folder.
@@ -97,34 +144,57 @@ def run(
     Returns:
         The run folder.
     """
-    resumed = cfg.resume is not None
-    folder = cli.start_run(cfg, cfg.resume or cfg.runs / cfg.name, resume=resumed, recipe=recipe)
+    with distributed.processes():
+        return _run(recipe, cfg, build(cfg), begin, iterate, save_policy, headline)
+
+
+def _run(
+    recipe: str,
+    cfg: C,
+    parts: P,
+    begin: Callable[[P, C], None],
+    iterate: Callable[[P, C, int], dict[str, float]],
+    save_policy: Callable[[P, C, Path], None],
+    headline: tuple[str, ...],
+) -> Path:
+    resumed, first = cfg.resume is not None, distributed.rank() == 0
+    folder = cfg.resume or cfg.runs / cfg.name
+    if first:
+        cli.start_run(cfg, folder, resume=resumed, recipe=recipe, processes=distributed.size())
+    distributed.wait()
     progress: dict[str, float] = {"iteration": 0, "minutes": 0.0}
-    saved = parts.checkpoint(folder / "checkpoints", progress)
+    saved = SavedRun(folder / "checkpoints", parts, progress)
     if resumed:
         saved.load()
     else:
         begin(parts, cfg)
-    logger = MCAPLogger(folder.name, folder.parent, resume=resumed)
+        distributed.share(part for part in parts.alike.values() if isinstance(part, nn.Module))
+    logger = MCAPLogger(folder.name, folder.parent, resume=resumed) if first else None
     start = time.monotonic() - 60.0 * progress["minutes"]
 
     def save() -> None:
-        saved.save(int(progress["iteration"]))
-        save_policy(parts, cfg, folder)
+        saved.save()
+        if first:
+            save_policy(parts, cfg, folder)
 
-    with Display(recipe, cfg.iterations, headline=headline) as display, cli.interruptible() as interrupted:
-        while progress["iteration"] < cfg.iterations and not interrupted():
-            metrics = iterate(parts, cfg, int(progress["iteration"]))
+    with contextlib.ExitStack() as stack:
+        display = stack.enter_context(Display(recipe, cfg.iterations, headline=headline)) if first else None
+        interrupted = stack.enter_context(cli.interruptible())
+        while progress["iteration"] < cfg.iterations and not distributed.anyone(interrupted()):
+            metrics = distributed.average_metrics(iterate(parts, cfg, int(progress["iteration"])))
             progress["iteration"] += 1
             progress["minutes"] = metrics["time/minutes"] = (time.monotonic() - start) / 60.0
-            logger.log_metrics(metrics, step=int(progress["iteration"]))
-            display.update(int(progress["iteration"]), metrics)
+            if logger is not None and display is not None:
+                logger.log_metrics(metrics, step=int(progress["iteration"]))
+                display.update(int(progress["iteration"]), metrics)
             if progress["iteration"] % cfg.checkpoint_every == 0:
                 save()
-            if cfg.max_minutes is not None and progress["minutes"] >= cfg.max_minutes:
+            late = cfg.max_minutes is not None and progress["minutes"] >= cfg.max_minutes
+            if distributed.anyone(late):
                 break
     save()
-    logger.close()
+    if logger is not None:
+        logger.close()
+        print(f"saved {folder}")
     parts.env.close()
-    print(f"saved {folder}")
     return folder

@@ -28,7 +28,6 @@ from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import features
 from agility_rl.losses import AdaptationLoss, HybridPPOLoss
 from agility_rl.modules import Critic, Discriminator, FeatureNormalizer, Teacher
-from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.ppo import PPOUpdate
 from agility_rl.training.precision import hidden_precision
 from agility_rl.training.rollout import Rollout
@@ -122,11 +121,16 @@ class Components:
         """Source of minibatch order."""
         return self.seeds.generator("batches")
 
-    def checkpoint(self, folder: Path, progress: dict[str, float]) -> RunCheckpoint:
-        """All that a bit-exact continuation needs; what is frozen comes from its own artifact."""
-        names = ("seeds", "env", "teacher", "critic", "curriculum", "rollout")
-        names += ("policy_optimizer", "adaptation_optimizer")
-        return RunCheckpoint(folder, progress=progress, **{name: getattr(self, name) for name in names})
+    @property
+    def alike(self) -> dict[str, Any]:
+        """What every process holds alike; what is frozen comes from its own artifact."""
+        names = ("teacher", "critic", "curriculum", "policy_optimizer", "adaptation_optimizer")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def own(self) -> dict[str, Any]:
+        """What each process has for itself."""
+        return {name: getattr(self, name) for name in ("seeds", "env", "rollout")}
 
 
 def build(cfg: Config) -> Components:

@@ -40,7 +40,7 @@ from tsc_student_setup import (
 from agility_rl import keys
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2.camera import dequantize
-from agility_rl.training import cli
+from agility_rl.training import cli, distributed
 
 HEADLINE: tuple[str, ...] = ("time/minutes", "success", "episodes", "falls_per_minute")
 HEADLINE += ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_byol", "spread")
@@ -61,7 +61,8 @@ def imitate(parts: Components, cfg: Config, window: TensorDictBase, iteration: i
             total = torch.stack([value for name, value in losses.items() if name.startswith("loss_")]).sum()
             parts.optimizer.zero_grad(set_to_none=True)
             finite(total, "the imitation", iteration).backward()
-            parameters = parts.optimizer.param_groups[0]["params"]
+            parameters = distributed.optimized(parts.optimizer)
+            distributed.average_gradients(parameters)
             norm = torch.nn.utils.clip_grad_norm_(parameters, own.max_grad_norm)
             parts.optimizer.step()
             found.append(losses.detach().set("grad_norm", norm))
@@ -76,6 +77,7 @@ def represent(parts: Components, iteration: int, images: Tensor) -> dict[str, Te
     losses = byol.loss(TensorDict(views, [len(images)]))
     byol.optimizer.zero_grad(set_to_none=True)
     finite(losses["loss_byol"], "BYOL", iteration).backward()
+    distributed.average_gradients(distributed.optimized(byol.optimizer))
     byol.optimizer.step()
     byol.average.step()
     return dict(losses.detach().items())
@@ -152,7 +154,7 @@ def train(cfg: Config) -> Path:
     return run(
         "tsc_student",
         cfg,
-        build(cfg, trained),
+        lambda cfg: build(cfg, trained),
         begin=begin,
         iterate=iterate,
         save_policy=save_policy,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from rollouts import Controller
@@ -22,7 +23,6 @@ from agility_rl.envs import AgilityEnv
 from agility_rl.go2 import features
 from agility_rl.losses import BYOLLoss, StudentLoss
 from agility_rl.modules import BYOL, DepthAugmentation, RecurrentStudent, Teacher
-from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.precision import hidden_precision
 from agility_rl.training.seeding import Seeds, seed_everything
 
@@ -64,13 +64,18 @@ class Components:
         """Source of minibatch order."""
         return self.seeds.generator("batches")
 
-    def checkpoint(self, folder: Path, progress: dict[str, float]) -> RunCheckpoint:
-        """All that a bit-exact continuation needs; what is frozen comes from its own artifact."""
-        names = ("seeds", "env", "student", "collector", "curriculum", "optimizer")
-        parts = {name: getattr(self, name) for name in names}
+    @property
+    def alike(self) -> dict[str, Any]:
+        """What every process holds alike; what is frozen comes from its own artifact."""
+        parts = {name: getattr(self, name) for name in ("student", "curriculum", "optimizer")}
         if self.representation is not None:
             parts |= {"byol": self.representation.loss, "byol_optimizer": self.representation.optimizer}
-        return RunCheckpoint(folder, progress=progress, **parts)
+        return parts
+
+    @property
+    def own(self) -> dict[str, Any]:
+        """What each process has for itself."""
+        return {name: getattr(self, name) for name in ("seeds", "env", "collector")}
 
 
 def resolve(cfg: Config) -> tuple[Config, Trained]:

@@ -127,7 +127,7 @@ def train(cfg: Config) -> Path:
     return run(
         "tsc_teacher",
         cfg,
-        build(cfg),
+        build,
         begin=begin,
         iterate=iterate,
         save_policy=save_policy,

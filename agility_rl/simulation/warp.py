@@ -201,7 +201,7 @@ class WarpSimulator:
         if bool((self._seen & _OF_ALL).any()):
             contacts = self._data.naconmax // self.num_simulations
             raise RuntimeError(
-                f"more contacts than there is room for, so that some were left out; give more max_contacts than {contacts}"
+                f"more contacts than there is room for, and some were left out; give more max_contacts than {contacts}"
             )
         number = int(((self._seen & _OF_ONE) != 0).sum())
         if number and not self._told:

@@ -10,6 +10,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import KLAdaptiveLR, LossModule
 
+from agility_rl.training import distributed
+
 Extra = Callable[[TensorDictBase], Tensor]
 
 
@@ -17,7 +19,8 @@ class PPOUpdate:
     """Descends a PPO loss over a collected batch.
 
     Advantages are normalised over the whole batch. After each epoch the divergence between the policy that collected
-    and the present one, on the last minibatch, may change the learning rate.
+    and the present one, on the last minibatch, may change the learning rate. Of several processes
+    (:mod:`agility_rl.training.distributed`), each brings a batch: moments, gradients and divergence are those of all.
 
     Source: Schulman et al. 2017, arXiv:1707.06347; Table S1 (clip, learning rate); normalisation and adaptive rate:
     released code (method notes, section 3.7).
@@ -87,13 +90,14 @@ class PPOUpdate:
             Metrics of the last minibatch, ``kl`` and ``learning_rate``.
         """
         advantage = batch["advantage"]
-        batch["advantage"] = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        mean, deviation = distributed.moments(advantage)
+        batch["advantage"] = (advantage - mean) / (deviation + 1e-8)
         names = dict.fromkeys((*self.loss.in_keys, "advantage", "value_target", *self.keep))
         flat = batch.select(*(name for name in names if "next" not in name), strict=False).flatten()
         size = flat.numel() // self.minibatches
         if size < 1:
             raise ValueError(f"expected at least {self.minibatches} samples, one a minibatch, got {flat.numel()}")
-        parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
+        parameters = distributed.optimized(self.optimizer)
         device = advantage.device.type
         metrics: dict[str, Tensor] = {}
         for _ in range(self.epochs):
@@ -109,12 +113,13 @@ class PPOUpdate:
                             loss = loss + extra(sample)
                 self.optimizer.zero_grad(set_to_none=True)
                 loss.backward()
+                distributed.average_gradients(parameters)
                 torch.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
                 self.optimizer.step()
             metrics = {name: value.detach() for name, value in result.items() if value.numel() == 1}
             if self.divergence is not None and not critic_only:
                 with torch.no_grad():
-                    metrics["kl"] = self.divergence(sample)
+                    metrics["kl"] = distributed.average(self.divergence(sample))
                 if self.schedule is not None:
                     self.schedule.step(metrics["kl"])
         metrics["learning_rate"] = torch.tensor(self.optimizer.param_groups[0]["lr"])

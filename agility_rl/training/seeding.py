@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from agility_rl.training import distributed
+
 
 class Seeds:
     """Named random streams that all follow from one seed.
@@ -18,13 +20,14 @@ class Seeds:
     Register the object in a :class:`~agility_rl.training.checkpoint.RunCheckpoint` and a resumed run draws what an
     uninterrupted one would have drawn.
 
-    .. math:: s_{name} = \\mathrm{SeedSequence}(seed, \\mathrm{crc32}(name))
+    .. math:: s_{name} = \\mathrm{SeedSequence}(seed, \\mathrm{crc32}(name), rank)
 
     Source: numpy ``SeedSequence`` (O'Neill's hash); no paper formula.
 
     Args:
         seed: non-negative integer.
         device: where the torch generators live.
+        rank: of several processes with one seed; the first one's streams are those of a single process.
 
     Raises:
         ValueError: if the seed is negative.
@@ -36,17 +39,18 @@ class Seeds:
         tensor([True])
     """
 
-    def __init__(self, seed: int, device: torch.device | str = "cpu") -> None:
+    def __init__(self, seed: int, device: torch.device | str = "cpu", rank: int = 0) -> None:
         if seed < 0:
             raise ValueError(f"a seed must be at least 0, got {seed}")
-        self.seed = seed
+        self.seed, self.rank = seed, rank
         self.device = torch.device(device)
         self._torch: dict[str, torch.Generator] = {}
         self._numpy: dict[str, np.random.Generator] = {}
 
     def integer(self, name: str) -> int:
         """Seed of one component, 0 <= seed < 2**63; the same whenever it is asked for."""
-        sequence = np.random.SeedSequence([self.seed, zlib.crc32(name.encode())])
+        entropy = [self.seed, zlib.crc32(name.encode()), *([self.rank] if self.rank else [])]
+        sequence = np.random.SeedSequence(entropy)
         return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
 
     def generator(self, name: str) -> torch.Generator:
@@ -90,14 +94,14 @@ def seed_everything(seed: int) -> Seeds:
     """Seed the global generators of Python, NumPy and torch (all devices) and return the named streams.
 
     Global generators serve the libraries that offer nothing else (initial weights of ``torch.nn``, TorchRL's policy
-    sampling); our own components take a generator from the streams.
+    sampling); our own components take a generator from the streams. Every process has streams of its own.
 
     Example:
         >>> _ = seed_everything(3); first = torch.rand(1)
         >>> _ = seed_everything(3); bool(first == torch.rand(1))
         True
     """
-    seeds = Seeds(seed)
+    seeds = Seeds(seed, rank=distributed.rank())
     random.seed(seeds.integer("python"))
     np.random.seed(seeds.integer("numpy") % 2**32)  # noqa: NPY002  (the global state is what is seeded here)
     torch.manual_seed(seeds.integer("torch"))

@@ -198,3 +198,25 @@ def test_an_anchor_holds_the_policy_to_the_one_it_started_from(
     assert any(parameter.grad is not None for parameter in parts.bbc.actor.parameters())
     with pytest.raises(ValueError, match="anchor holds on to the policy of --init-from"):
         setup.build(replace(presets.SMOKE, imitation=imitation))
+
+
+def run_two(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Two processes on one machine, as a user starts them."""
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "--standalone"]
+    command = [*launcher, str(RECIPE), "smoke", "--runs", str(folder), *options]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=300, env=ONE_THREAD)
+
+
+def test_two_processes_train_one_policy_and_resume_bit_for_bit(tmp_path: Path) -> None:
+    printed = run_two(tmp_path, "--name", "whole", "--iterations", "4").stdout
+    assert printed.count("saved") == 1, "one of them writes"
+    assert read_scalars(tmp_path / "whole")["reward/task"][0].tolist() == [1, 2, 3, 4]
+    run_two(tmp_path, "--name", "halves", "--iterations", "2")
+    assert (tmp_path / "halves" / "checkpoints" / "process-1").is_dir()
+    run_two(tmp_path, "--resume", str(tmp_path / "halves"), "--iterations", "4")
+    whole, halves = (Artifact.load(tmp_path / name / "policy").state for name in ("whole", "halves"))
+    assert not [name for name, tensor in whole.items() if not torch.equal(tensor, halves[name])]
+    # Another number of processes goes on with the networks, and with robots that begin anew.
+    run(tmp_path, "--resume", str(tmp_path / "halves"), "--iterations", "5")
+    run_two(tmp_path, "--resume", str(tmp_path / "halves"), "--iterations", "6")
+    assert read_scalars(tmp_path / "halves")["reward/task"][0].tolist() == [1, 2, 3, 4, 5, 6]

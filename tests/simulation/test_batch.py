@@ -3,59 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from agility_rl.go2 import constants
 from agility_rl.go2.model import build_spec
-from agility_rl.simulation import PARAMETERS, BatchSimulator
-
-POSE = torch.tensor(constants.DEFAULT_POSE)
-FEET = list(constants.FOOT_GROUPS)
-STATE = ("root_position", "root_quaternion", "root_linear_velocity", "root_angular_velocity")
-STATE += ("joint_position", "joint_velocity", "contact_force", "unstable")
-
-
-def everyone(n: int) -> Tensor:
-    return torch.ones(n, dtype=torch.bool)
-
-
-def only(n: int, *rows: int) -> Tensor:
-    mask = torch.zeros(n, dtype=torch.bool)
-    mask[list(rows)] = True
-    return mask
-
-
-def standing(n: int, height: float = 0.3, **changes: Tensor) -> dict[str, Tensor]:
-    state = {
-        "root_position": torch.tensor([0.0, 0.0, height]).repeat(n, 1),
-        "root_quaternion": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
-        "root_linear_velocity": torch.zeros(n, 3),
-        "root_angular_velocity": torch.zeros(n, 3),
-        "joint_position": POSE.repeat(n, 1),
-        "joint_velocity": torch.zeros(n, 12),
-    }
-    return state | changes
-
-
-def targets(n: int, steps: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return POSE + 0.25 * torch.randn(steps, n, 12, generator=generator)
-
-
-def snapshot(simulator: BatchSimulator) -> dict[str, Tensor]:
-    return {name: getattr(simulator, name) for name in STATE}
-
-
-def assert_same(left: dict[str, Tensor], right: dict[str, Tensor], rows: Any = slice(None)) -> None:
-    for name in STATE:
-        assert torch.equal(left[name][rows], right[name][rows]), name
-
+from agility_rl.simulation import BatchSimulator
+from tests.simulation.robot_states import FEET, POSE, assert_same, everyone, only, snapshot, standing, targets
 
 # Stepping ------------------------------------------------------------------------------------------------------------
 
@@ -203,117 +160,6 @@ def test_reset_repeats_exactly() -> None:
     assert_same(*runs)
 
 
-# Parameters ----------------------------------------------------------------------------------------------------------
-
-
-def test_every_parameter_is_read_back_and_masked() -> None:
-    simulator = BatchSimulator(3, num_threads=1)
-    for name, (size, _) in PARAMETERS.items():
-        before = simulator.parameter(name)
-        new = before + 0.01
-        simulator.set_parameters(only(3, 2), **{name: new})
-        after = simulator.parameter(name)
-        assert after.shape == (3, size)
-        torch.testing.assert_close(after[2], new[2])
-        assert torch.equal(after[:2], before[:2])
-
-
-@pytest.mark.parametrize("name", [name for name in PARAMETERS if name != "ground_friction"])
-def test_every_parameter_changes_motion_only_in_its_rows(name: str) -> None:
-    plain, changed = BatchSimulator(2, num_threads=1), BatchSimulator(2, num_threads=1)
-    change = {"action_delay": 0.01, "torque_limit": -18.0}.get(name, 0.05)
-    changed.set_parameters(only(2, 1), **{name: changed.parameter(name) + change})
-    for target in targets(2, 5):
-        plain.step(target)
-        changed.step(target)
-    torch.testing.assert_close(changed.joint_position[0], plain.joint_position[0], atol=1e-5, rtol=0)
-    assert not torch.allclose(changed.joint_position[1], plain.joint_position[1], atol=1e-5)
-
-
-def test_trunk_mass_is_carried_by_the_feet() -> None:
-    simulator = BatchSimulator(2, num_threads=1)
-    simulator.set_parameters(only(2, 1), trunk_mass_offset=torch.full((2, 1), 1.5))
-    for _ in range(100):
-        simulator.step(POSE.expand(2, 12))
-    carried = simulator.contact_force[:, FEET].sum(-1)
-    assert (carried[1] - carried[0]).item() == pytest.approx(1.5 * 9.81, rel=0.05)
-
-
-def test_centre_of_mass_ahead_loads_the_front_feet() -> None:
-    simulator = BatchSimulator(2, num_threads=1)
-    simulator.set_parameters(only(2, 1), trunk_com_offset=torch.tensor([0.1, 0.0, 0.0]).expand(2, 3))
-    for _ in range(100):
-        simulator.step(POSE.expand(2, 12))
-    front = simulator.contact_force[:, FEET[:2]].sum(-1)
-    assert front[1] > front[0] + 10.0
-
-
-def test_friction_slows_a_slide_by_coulombs_law() -> None:
-    simulator = BatchSimulator(3, num_threads=1)
-    for _ in range(60):
-        simulator.step(POSE.expand(3, 12))
-    simulator.set_parameters(everyone(3), ground_friction=torch.tensor([[0.02], [0.05], [0.1]]))
-    simulator.push(everyone(3), torch.tensor([1.0, 0.0]).expand(3, 2))
-    for _ in range(20):
-        simulator.step(POSE.expand(3, 12))
-    # All feet slide: v = v_0 - mu g t after 0.4 s.
-    expected = torch.tensor([1.0 - 0.02 * 9.81 * 0.4, 1.0 - 0.05 * 9.81 * 0.4, 1.0 - 0.1 * 9.81 * 0.4])
-    torch.testing.assert_close(simulator.root_linear_velocity[:, 0], expected, atol=0.04, rtol=0)
-
-
-def test_set_const_keeps_the_state() -> None:
-    simulator = BatchSimulator(2, num_threads=1)
-    for target in targets(2, 3):
-        simulator.step(target)
-    before = simulator.batch.state.copy()
-    simulator.set_parameters(everyone(2), trunk_mass_offset=torch.ones(2, 1), armature=torch.full((2, 12), 0.02))
-    np.testing.assert_array_equal(simulator.batch.state, before)
-
-
-def test_delay_of_a_control_step_shifts_the_targets() -> None:
-    delayed, plain = BatchSimulator(1, num_threads=1), BatchSimulator(1, num_threads=1)
-    delayed.set_parameters(everyone(1), action_delay=torch.full((1, 1), 0.02))
-    for simulator in (delayed, plain):
-        simulator.reset(everyone(1), **standing(1))
-    sequence = targets(1, 6)
-    for target in sequence:
-        delayed.step(target)
-    plain.step(POSE.expand(1, 12))
-    for target in sequence[:-1]:
-        plain.step(target)
-    assert_same(snapshot(delayed), snapshot(plain))
-
-
-def test_delay_within_a_control_step_switches_between_physics_steps() -> None:
-    simulator = BatchSimulator(2, num_threads=1)
-    simulator.set_parameters(everyone(2), action_delay=torch.tensor([[0.005], [0.015]]))
-    simulator.reset(everyone(2), **standing(2))
-    sequence = targets(2, 4)
-    for target in sequence:
-        simulator.step(target)
-    model = build_spec().compile()
-    for row, late in ((0, 1), (1, 3)):
-        loop = mujoco.MjData(model)
-        loop.qpos[:] = (0, 0, np.float32(0.3), 1, 0, 0, 0, *POSE.tolist())
-        loop.ctrl[:] = POSE.tolist()
-        mujoco.mj_forward(model, loop)
-        for target in sequence:
-            mujoco.mj_step(model, loop, late)
-            loop.ctrl[:] = target[row].numpy()
-            mujoco.mj_step(model, loop, 4 - late)
-        np.testing.assert_array_equal(simulator.joint_position[row].numpy(), loop.qpos[7:].astype(np.float32))
-
-
-def test_wrong_parameters_are_refused() -> None:
-    simulator = BatchSimulator(2, num_threads=1)
-    with pytest.raises(ValueError, match="stifness"):
-        simulator.set_parameters(everyone(2), stifness=torch.zeros(2, 12))
-    with pytest.raises(ValueError, match=r"\[2, 12\]"):
-        simulator.set_parameters(everyone(2), stiffness=torch.zeros(2, 1))
-    with pytest.raises(ValueError, match="action_delay"):
-        simulator.set_parameters(everyone(2), action_delay=torch.full((2, 1), 0.5))
-
-
 # Pushes, rays, instability, saving -----------------------------------------------------------------------------------
 
 
@@ -375,13 +221,6 @@ def test_loading_restores_parameters_that_the_saved_simulation_never_set() -> No
     simulator.set_parameters(everyone(1), stiffness=torch.full((1, 12), 20.0))
     simulator.load_state_dict(saved)
     assert torch.equal(simulator.parameter("stiffness"), torch.full((1, 12), 40.0))
-
-
-def test_parameters_are_read_as_copies() -> None:
-    simulator = BatchSimulator(1, num_threads=1)
-    simulator.set_parameters(everyone(1), stiffness=torch.full((1, 12), 20.0))
-    simulator.parameter("stiffness").add_(1.0)
-    assert simulator.parameter("stiffness").max() == 20.0
 
 
 def test_saved_state_is_a_copy() -> None:
