@@ -99,6 +99,10 @@ ABDUCTION = 0.0955
 THIGH = 0.213
 """Distance from the thigh joint to the calf joint [m]. [M]"""
 
+THIGH_BOX = 0.11
+"""Length of the thigh's collision box, half-way down the thigh [m] (robot description of the released code: method
+notes, section 4.1; Menagerie's reaches down to the knee). So a knee that touches is the calf's, and no failure."""
+
 CALF = 0.213
 """Distance from the calf joint down to the foot's centre [m]. [M]"""
 

@@ -196,8 +196,8 @@ def _add_leg(spec, trunk, index, leg, collide, passive, gains, torque_limit) -> 
     thigh.add_geom(
         name=f"{leg}_thigh",
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=(0.1065, 0.01225, 0.017),
-        pos=(0, 0, -0.1065),
+        size=(constants.THIGH_BOX / 2, 0.01225, 0.017),
+        pos=(0, 0, -constants.THIGH / 2),
         quat=(0.5**0.5, 0, 0.5**0.5, 0),
         **collide,
     )

@@ -7,9 +7,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from agility_rl.go2 import constants
 from agility_rl.go2.model import build_spec
+from agility_rl.simulation import BatchSimulator
 
 
 @pytest.fixture(scope="module")
@@ -152,3 +154,22 @@ def test_the_contact_model_is_an_option() -> None:
         build_spec(contact_time=0.005)
     with pytest.raises(ValueError, match="pyramidal, elliptic, got 'round'"):
         build_spec(cone="round")  # type: ignore[arg-type]
+
+
+def test_a_knee_on_the_ground_is_the_calfs() -> None:
+    """As in the released robot description, where a landing that bends the legs fully is no failure."""
+    simulator = BatchSimulator(1, num_threads=1)
+    folded = torch.tensor([0.0, 0.0, -2.7]).repeat(4)[None]
+    everyone = torch.ones(1, dtype=torch.bool)
+    simulator.reset(
+        everyone,
+        root_position=torch.tensor([[0.0, 0.0, constants.THIGH + 0.005]]),
+        root_quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        root_linear_velocity=torch.zeros(1, 3),
+        root_angular_velocity=torch.zeros(1, 3),
+        joint_position=folded,
+        joint_velocity=torch.zeros(1, 12),
+    )
+    force = dict(zip(constants.CONTACT_GROUPS, simulator.contact_force[0].tolist(), strict=True))
+    for leg in constants.LEGS:
+        assert force[f"{leg}_calf"] > 5.0 and force[f"{leg}_thigh"] == 0.0, force
