@@ -1,7 +1,8 @@
 """Builds the Go2's MuJoCo model from primitives: no mesh, no download.
 
-Source of masses, inertias and collision shapes: MuJoCo Menagerie ``unitree_go2/go2.xml`` (BSD-3-Clause, Unitree
-Robotics), see NOTICE in LICENSE. Structure, sensors and actuators are our own.
+Source of masses, inertias and collision shapes (but for the length of the thighs'): MuJoCo Menagerie
+``unitree_go2/go2.xml`` (BSD-3-Clause, Unitree Robotics), see NOTICE in LICENSE. Structure, sensors and actuators are
+our own.
 """
 
 from __future__ import annotations

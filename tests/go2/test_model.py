@@ -163,7 +163,7 @@ def test_a_knee_on_the_ground_is_the_calfs() -> None:
     everyone = torch.ones(1, dtype=torch.bool)
     simulator.reset(
         everyone,
-        root_position=torch.tensor([[0.0, 0.0, constants.THIGH + 0.005]]),
+        root_position=torch.tensor([[0.0, 0.0, constants.THIGH - 0.01]]),
         root_quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         root_linear_velocity=torch.zeros(1, 3),
         root_angular_velocity=torch.zeros(1, 3),
