@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from tsc_setup import Curriculum
+from tsc_curriculum import Curriculum
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS

@@ -23,6 +23,9 @@ class RobotsConfig:
     """Factors on every command (method notes, section 5.1)."""
     episode_length: float = 40.0
     """Seconds (method notes, section 5.6)."""
+    start_spread: float = 1.0
+    """Times as far aside and turned as released (0.1 m, 0.2 rad) that robots start; more covers how they leave an
+    obstacle for the next (ours)."""
     num_threads: int | None = None
 
 

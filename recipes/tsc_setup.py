@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import KLAdaptiveLR
 from torchrl.objectives.value import GAE
-from tsc_config import Config, CurriculumConfig, RewardConfig, RobotsConfig
+from tsc_config import Config, RewardConfig, RobotsConfig
+from tsc_curriculum import Curriculum
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS, skill_index
@@ -38,63 +39,6 @@ OBSERVED = (
     *(keys.HEADING_ERROR, keys.OBSTACLE, keys.SCANDOTS),
 )
 """What the critic reads (method notes, section 5.4: all of it)."""
-
-
-@dataclass
-class Curriculum:
-    """Harder courses as soon as the present ones are mastered.
-
-    Attributes:
-        cfg: when, and by how much.
-        difficulty: share of the range of heights.
-        obstacles: most obstacles of an episode.
-        passed, failed: ``[7]``, moving averages of how often each type was passed and failed.
-        successes, episodes: finished since the last step.
-    """
-
-    cfg: CurriculumConfig
-    difficulty: float
-    obstacles: int
-    most: int
-    passed: Tensor = field(default_factory=lambda: torch.ones(len(OBSTACLES)))
-    failed: Tensor = field(default_factory=lambda: torch.ones(len(OBSTACLES)))
-    successes: int = 0
-    episodes: int = 0
-
-    @classmethod
-    def start(cls, cfg: CurriculumConfig, env: AgilityEnv) -> Curriculum:
-        """Where a run on a course begins."""
-        most = len(env.arena.layout.kinds)
-        return cls(cfg, cfg.difficulty, min(cfg.obstacles, most), most)
-
-    def update(self, passed: Tensor, failed: Tensor, successes: int, episodes: int) -> None:
-        """Count what an iteration has finished, and take a step if it is time."""
-        keep = 0.98
-        self.passed, self.failed = keep * self.passed + passed, keep * self.failed + failed
-        self.successes, self.episodes = self.successes + successes, self.episodes + episodes
-        if self.episodes < self.cfg.episodes:
-            return
-        if self.successes / self.episodes >= self.cfg.success:
-            if self.difficulty < 1.0:
-                self.difficulty = min(1.0, self.difficulty + self.cfg.difficulty_step)
-            else:
-                self.obstacles = min(self.most, self.obstacles + 1)
-        self.successes = self.episodes = 0
-
-    def start_weights(self, types: Tensor) -> Tensor:
-        """``[K]``, how often to start before each obstacle, from one-hot types ``[K, 7]``."""
-        rate = self.passed / (self.passed + self.failed)
-        return 1.0 + self.cfg.practice * ((1.0 - rate) / rate.clamp(min=0.1))[types.float().argmax(-1)]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Where it stands."""
-        names = ("difficulty", "obstacles", "passed", "failed", "successes", "episodes")
-        return {name: getattr(self, name) for name in names}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
-        for name, value in state.items():
-            setattr(self, name, value)
 
 
 @dataclass
@@ -228,6 +172,7 @@ def make_env(
         command_noise=robots.command_noise,
         randomization=COURSE_RANDOMIZATION if robots.randomize else None,
         episode_length=robots.episode_length,
+        start_spread=robots.start_spread,
         push_interval=robots.push_interval,
         **options,
     )

@@ -12,7 +12,8 @@ from rollouts import Controller
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 from tsc_artifacts import Trained, load_bbc_of, load_trained, trained_bbc
-from tsc_setup import Curriculum, make_env
+from tsc_curriculum import Curriculum
+from tsc_setup import make_env
 from tsc_student_config import AugmentationConfig, Config
 
 from agility_rl import keys

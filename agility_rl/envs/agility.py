@@ -76,6 +76,7 @@ class AgilityEnv(EnvBase):
         episode_length: seconds until truncation.
         goal_radius: distance at which a way-point is reached [m].
         start: before a random obstacle, or before the first.
+        start_spread: how many times as far aside and turned as released (:class:`~agility_rl.envs.arena.Arena`).
         push_interval: seconds between pushes; ``None`` for none.
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
         motion_offsets: which discriminator frames ``motion`` holds, in control steps from the oldest.
@@ -114,6 +115,7 @@ class AgilityEnv(EnvBase):
         episode_length: float = 40.0,
         goal_radius: float = GOAL_RADIUS,
         start: Literal["random", "first"] = "random",
+        start_spread: float = 1.0,
         push_interval: float | None = None,
         push_velocity: float = 0.5,
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
@@ -126,7 +128,7 @@ class AgilityEnv(EnvBase):
             raise ValueError(f"decision_steps must be at least 1, got {decision_steps}")
         self.generator = torch.Generator().manual_seed(seed)
         course = full_course() if course is None else course
-        self.arena = Arena(course, num_robots, self.generator, goal_radius, start)
+        self.arena = Arena(course, num_robots, self.generator, goal_radius, start, start_spread)
         pieces = self.arena.layout.pieces
         self.simulator = simulator or make_simulator(
             num_simulations=num_robots, scenery=pieces, **(simulator_options or {})

@@ -34,6 +34,7 @@ class Arena:
         generator: source of randomness.
         goal_radius: distance at which a way-point is reached [m].
         start: before a random obstacle, or before the first.
+        start_spread: how many times as far aside and turned as released; 4 covers how robots leave the obstacle before.
 
     Attributes:
         layout: where the obstacles stand.
@@ -44,7 +45,7 @@ class Arena:
         types: bool ``[K, 7]``, one-hot type of each obstacle.
 
     Raises:
-        ValueError: if ``start`` is something else.
+        ValueError: if ``start`` is something else, or ``start_spread`` out of its range.
     """
 
     def __init__(
@@ -54,10 +55,13 @@ class Arena:
         generator: torch.Generator,
         goal_radius: float = GOAL_RADIUS,
         start: Literal["random", "first"] = "random",
+        start_spread: float = 1.0,
     ) -> None:
         if start not in ("random", "first"):
             raise ValueError(f"expected start 'random' or 'first', got {start!r}")
-        self.generator, self.random_start = generator, start == "random"
+        if not 0.0 <= start_spread <= 10.0:
+            raise ValueError(f"start_spread must be from 0 to 10, got {start_spread}")
+        self.generator, self.random_start, self.start_spread = generator, start == "random", start_spread
         self.layout = CourseLayout(course, num_robots, generator)
         self.progress = CourseProgress(self.layout, goal_radius)
         self.scan = HeightScan(self.layout)
@@ -104,10 +108,11 @@ class Arena:
         self.progress.begin(mask, leg, torch.minimum(leg + self.max_obstacles, length))
 
         behind, aside, turn = torch.rand(3, n, generator=self.generator)
-        shift = torch.stack((-START_BEHIND * behind, START_ASIDE * (2.0 * aside - 1.0)), -1)
+        spread = self.start_spread
+        shift = torch.stack((-START_BEHIND * behind, spread * START_ASIDE * (2.0 * aside - 1.0)), -1)
         obstacle = self.progress.obstacle
         place = self.layout.world(obstacle, self.progress.local_goal() + shift)
-        yaw = self.layout.yaw[torch.arange(n), obstacle] + START_TURN * (2.0 * turn - 1.0)
+        yaw = self.layout.yaw[torch.arange(n), obstacle] + spread * START_TURN * (2.0 * turn - 1.0)
         height = self.ground(place, simulator)[:, None] + constants.STANDING_HEIGHT + CLEARANCE
         simulator.reset(
             mask,

@@ -41,6 +41,18 @@ def test_robots_start_before_a_random_obstacle_and_face_it() -> None:
     assert (simulator.contact_force[:, :1] == 0.0).all()  # nobody starts inside something
 
 
+def test_starts_may_spread_to_how_robots_leave_an_obstacle() -> None:
+    arena, simulator = build(n=400, start_spread=4.0)
+    begin(arena, simulator)
+    offset = arena.progress.local - arena.progress.local_goal()
+    assert 0.3 < offset[:, 1].abs().max() <= 0.4 + 1e-5 and offset[:, 0].min() >= -0.2 - 1e-5
+    yaw = rotations.to_euler(simulator.root_quaternion)[2]
+    turn = rotations.wrap_angle(yaw - arena.layout.yaw[torch.arange(400), arena.progress.obstacle])
+    assert 0.7 < turn.abs().max() <= 0.8 + 1e-5
+    with pytest.raises(ValueError, match="start_spread must be from 0 to 10, got -1"):
+        build(start_spread=-1.0)
+
+
 def test_a_start_before_the_first() -> None:
     arena, simulator = build(start="first")
     begin(arena, simulator)
