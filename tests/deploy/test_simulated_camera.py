@@ -87,5 +87,7 @@ def test_a_robot_meets_what_stands_around_it(tmp_path: Path) -> None:
     robot = SimulatedRobot(surround=add_world(file))
     robot.place(np.array([0.0, 0.0, 0.65, 1.0, 0.0, 0.0, 0.0, *constants.DEFAULT_POSE]), np.zeros(18))
     robot.advance(1.0)
-    touched = {mujoco.mj_id2name(robot.model, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in robot.data.contact.geom[:, 0]}
+    touched = {
+        mujoco.mj_id2name(robot.model, mujoco.mjtObj.mjOBJ_GEOM, geom) for geom in robot.data.contact.geom.ravel()
+    }
     assert "world/step" in touched and robot.data.qpos[2] > 0.2

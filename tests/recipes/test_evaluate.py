@@ -65,7 +65,7 @@ def test_an_artifact_of_another_kind_or_network_is_refused(tmp_path: Path, evalu
         load(tmp_path / "bare")
     other = build_manifest("bbc", {}, control_period=0.02) | {"network": {"hidden": [8]}}
     Artifact.save(tmp_path / "other", weights, other)
-    with pytest.raises(ValueError, match="weights are not those of the network"):
+    with pytest.raises(ValueError, match="weights are not those of the expected network"):
         load(tmp_path / "other")
 
 
