@@ -88,15 +88,15 @@ class Laps:
 class SavedRun:
     """Checkpoints of a run: one of all that is alike and of the first process, one more of each other process.
 
-    With as many processes as wrote it, a run goes on bit for bit; with another number, robots and memories begin anew.
+    With as many processes as wrote it, a run goes on bit for bit; robots and memories of further ones begin anew.
     """
 
     def __init__(self, folder: Path, parts: Parts, progress: dict[str, float]) -> None:
-        rank = distributed.rank()
-        self.progress, self._alike = progress, {"progress", *parts.alike}
-        own = parts.own if rank == 0 else {}
-        self._main = RunCheckpoint(folder, progress=progress, **parts.alike, **own)
-        self._own = None if rank == 0 else RunCheckpoint(folder / f"process-{rank}", **parts.own)
+        self.progress, self._rank = progress, distributed.rank()
+        self._alike = {"progress", *parts.alike}
+        first = self._rank == 0
+        self._main = RunCheckpoint(folder, progress=progress, **parts.alike, **(parts.own if first else {}))
+        self._own = None if first else RunCheckpoint(folder / f"process-{self._rank}", **parts.own)
 
     def save(self) -> None:
         """Write what belongs to this process; the first one's file comes last."""
@@ -110,13 +110,8 @@ class SavedRun:
 
     def load(self) -> None:
         """Restore the newest checkpoint."""
-        step = self._main.load(components={"progress"})
-        if self.progress.get("processes", 1) != distributed.size():
-            self._main.load(step, components=self._alike)
-        elif self._own is None:
-            self._main.load(step)
-        else:
-            self._main.load(step, components=self._alike)
+        step = self._main.load(components=None if self._own is None else self._alike)
+        if self._own is not None and self._rank < self.progress.get("processes", 1):
             self._own.load(step)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -70,6 +71,7 @@ class SimulationParameters:
             shape = (self.num_simulations, PARAMETERS[name][0])
             if tuple(value.shape) != shape:
                 raise ValueError(f"{name} must be {list(shape)}, got {list(value.shape)}")
+        for name, value in fields.items():
             changed = torch.where(mask[:, None], value.float(), self.value(name))
             self._write(name, mask, changed)
             self.values[name] = changed
@@ -101,34 +103,34 @@ class SimulationParameters:
         model = self.world.model
         trunk = model.body("trunk").id
         if name == "stiffness":
-            self._put("actuator_gainprm", (slice(None), 0), rows, value)
-            self._put("actuator_biasprm", (slice(None), 1), rows, -value)
+            self._put("actuator_gainprm", rows, value, ..., 0)
+            self._put("actuator_biasprm", rows, -value, ..., 1)
         elif name == "damping":
-            self._put("actuator_biasprm", (slice(None), 2), rows, -value)
+            self._put("actuator_biasprm", rows, -value, ..., 2)
         elif name == "torque_limit":
-            self._put("actuator_forcerange", (slice(None), 0), rows, -value)
-            self._put("actuator_forcerange", (slice(None), 1), rows, value)
+            self._put("actuator_forcerange", rows, -value, ..., 0)
+            self._put("actuator_forcerange", rows, value, ..., 1)
         elif name == "ground_friction":
-            for shape in self.world.ground:
-                self._put("geom_friction", (shape, 0), rows, value[:, 0])
+            self._put("geom_friction", rows, value, self.world.ground, 0)
         elif name == "trunk_mass_offset":
             mass = model.body_mass[trunk] + value[:, 0].double()
-            self._put("body_mass", (trunk,), rows, mass)
+            self._put("body_mass", rows, mass, trunk)
             inertia = torch.tensor(model.body_inertia[trunk], device=self.device)
-            self._put("body_inertia", (trunk,), rows, inertia * (mass / model.body_mass[trunk])[:, None])
+            self._put("body_inertia", rows, inertia * (mass / model.body_mass[trunk])[:, None], trunk)
         elif name == "trunk_com_offset":
             centre = torch.tensor(model.body_ipos[trunk], device=self.device)
-            self._put("body_ipos", (trunk,), rows, centre + value.double())
+            self._put("body_ipos", rows, centre + value.double(), trunk)
         elif name == "action_delay":
             steps = (value[:, 0] / self.world.sim_dt).round().long()
             if bool((steps > self.world.substeps).any()):
                 raise ValueError(f"action_delay must be at most one control step, {self.world.control_dt} s")
             self.delay = steps if bool(steps.any()) else None
         else:
-            self._put(_OF_JOINTS[name], (JOINT_SPEEDS,), rows, value)
+            self._put(_OF_JOINTS[name], rows, value, JOINT_SPEEDS)
 
-    def _put(self, name: str, part: tuple[int | slice, ...], rows: Tensor, value: Tensor) -> None:
+    def _put(self, name: str, rows: Tensor, value: Tensor, *part: Any) -> None:
         """Write into a part of a field; without indexing by rows, which would make a GPU wait."""
-        view = self._field(name)[:, *part]
-        chosen = rows.reshape(-1, *[1] * (view.dim() - 1))
-        view.copy_(torch.where(chosen, value.to(view.dtype), view))
+        field = self._field(name)
+        present = field[:, *part]
+        chosen = rows.reshape(-1, *[1] * (present.dim() - 1))
+        field[:, *part] = torch.where(chosen, value.to(field.dtype), present)

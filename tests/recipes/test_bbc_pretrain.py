@@ -216,7 +216,7 @@ def test_two_processes_train_one_policy_and_resume_bit_for_bit(tmp_path: Path) -
     run_two(tmp_path, "--resume", str(tmp_path / "halves"), "--iterations", "4")
     whole, halves = (Artifact.load(tmp_path / name / "policy").state for name in ("whole", "halves"))
     assert not [name for name, tensor in whole.items() if not torch.equal(tensor, halves[name])]
-    # Another number of processes goes on with the networks, and with robots that begin anew.
+    # One goes on with what belonged to the first; the second of two that follow begins with robots of its own.
     run(tmp_path, "--resume", str(tmp_path / "halves"), "--iterations", "5")
     run_two(tmp_path, "--resume", str(tmp_path / "halves"), "--iterations", "6")
     assert read_scalars(tmp_path / "halves")["reward/task"][0].tolist() == [1, 2, 3, 4, 5, 6]

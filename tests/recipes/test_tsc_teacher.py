@@ -68,9 +68,9 @@ def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
 
 
 def test_the_curriculum_by_hand(module: Module) -> None:
-    setup, config = module("tsc_setup"), module("tsc_config")
+    grown, config = module("tsc_curriculum"), module("tsc_config")
     cfg = config.CurriculumConfig(success=0.8, episodes=10, difficulty_step=0.5, practice=2.0)
-    curriculum = setup.Curriculum(cfg, 0.0, 1, most=3)
+    curriculum = grown.Curriculum(cfg, 0.0, 1, most=3)
     nothing = torch.zeros(len(OBSTACLES))
     steps = []
     for successes in (8, 7, 9, 10, 10, 10):  # of ten each: up, stays, full difficulty, then one obstacle more at a time
