@@ -19,7 +19,7 @@ from agility_rl.simulation.depth_camera import DepthCamera
 from agility_rl.simulation.parameters import SimulationParameters
 from agility_rl.simulation.scenery import Piece
 from agility_rl.simulation.terrain import HeightField
-from agility_rl.simulation.world import FORCES, JOINT_SPEEDS, JOINTS, World
+from agility_rl.simulation.world import FORCES, JOINT_SPEEDS, JOINTS, World, check_finite, check_target
 
 _WARNINGS = [
     int(warning)
@@ -99,10 +99,7 @@ class BatchSimulator:
         Raises:
             ValueError: if ``target`` has another shape.
         """
-        if tuple(target.shape) != (self.num_simulations, constants.NUM_JOINTS):
-            raise ValueError(
-                f"target must be [{self.num_simulations}, {constants.NUM_JOINTS}], got {list(target.shape)}"
-            )
+        check_target(target, self.num_simulations)
         failed: list[int] = []
         if self._parameters.delay is None:
             self._ctrl[:] = target.numpy()
@@ -159,10 +156,7 @@ class BatchSimulator:
             return
         qpos = torch.cat((root_position, root_quaternion, joint_position), -1)[mask]
         qvel = torch.cat((root_linear_velocity, root_angular_velocity, joint_velocity), -1)[mask]
-        finite = torch.isfinite(torch.cat((qpos, qvel), -1)).all(-1)
-        if not bool(finite.all()):
-            rows = mask.nonzero()[:, 0][~finite].tolist()
-            raise ValueError(f"the states of rows {rows[:8]} are not finite; look for NaN in what they come from")
+        check_finite(mask.nonzero()[:, 0], qpos, qvel)
         angle, rate = self._qpos[ids][:, self._hinges], self._qvel[ids][:, self._hinge_speeds]
         placed = (self._mocap_position[ids], self._mocap_quaternion[ids]) if self.scenery else None
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
@@ -180,13 +174,7 @@ class BatchSimulator:
         self._read()
 
     def place(self, mask: Tensor, position: Tensor, quaternion: Tensor, hinge_angle: Tensor) -> None:
-        """Put the scenery of the rows of a bool mask ``[N]`` somewhere, hinges at rest; other rows are left alone.
-
-        Args:
-            mask: bool ``[N]``.
-            position: ``[N, P, 3]`` [m], one for each piece of :attr:`scenery`, world frame.
-            quaternion: ``[N, P, 4]`` (w, x, y, z).
-            hinge_angle: ``[N, H]`` [rad], one for each piece that has a hinge, in the same order.
+        """Put the scenery of some rows somewhere (:meth:`agility_rl.simulation.Simulator.place`).
 
         Raises:
             ValueError: if a shape is another or a number is not finite.

@@ -114,7 +114,14 @@ class Simulator(Protocol):
         ...
 
     def place(self, mask: Tensor, position: Tensor, quaternion: Tensor, hinge_angle: Tensor) -> None:
-        """Put the scenery of the rows of a bool mask: ``[N, P, 3]`` [m], ``[N, P, 4]``, ``[N, H]`` [rad]."""
+        """Put the scenery of the rows of a bool mask ``[N]`` somewhere, hinges at rest; other rows are left alone.
+
+        Args:
+            mask: bool ``[N]``.
+            position: ``[N, P, 3]`` [m], one for each piece of :attr:`scenery`, world frame.
+            quaternion: ``[N, P, 4]`` (w, x, y, z).
+            hinge_angle: ``[N, H]`` [rad], one for each piece that has a hinge, in the same order.
+        """
         ...
 
     def set_parameters(self, mask: Tensor, **fields: Tensor) -> None:

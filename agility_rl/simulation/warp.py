@@ -17,7 +17,7 @@ from agility_rl.simulation.parameters import FIELDS, SimulationParameters
 from agility_rl.simulation.scenery import Piece
 from agility_rl.simulation.terrain import HeightField
 from agility_rl.simulation.warp_camera import WarpDepthCamera
-from agility_rl.simulation.world import FORCES, JOINT_SPEEDS, JOINTS, World
+from agility_rl.simulation.world import FORCES, JOINT_SPEEDS, JOINTS, World, check_finite, check_target
 
 try:
     import warp as wp
@@ -158,10 +158,7 @@ class WarpSimulator:
             ValueError: if ``target`` has another shape.
             RuntimeError: if there were more contacts than there is room for (on a GPU, after 500 steps at the latest).
         """
-        if tuple(target.shape) != (self.num_simulations, constants.NUM_JOINTS):
-            raise ValueError(
-                f"target must be [{self.num_simulations}, {constants.NUM_JOINTS}], got {list(target.shape)}"
-            )
+        check_target(target, self.num_simulations)
         delay = self._parameters.delay
         self._flags.zero_()
         self._ctrl.copy_(target)
@@ -236,10 +233,7 @@ class WarpSimulator:
         qpos = torch.cat((root_position, root_quaternion, joint_position), -1)
         qvel = torch.cat((root_linear_velocity, root_angular_velocity, joint_velocity), -1)
         if self.device.type == "cpu":
-            finite = torch.isfinite(torch.cat((qpos, qvel), -1)).all(-1) | ~mask
-            if not bool(finite.all()):
-                rows = (~finite).nonzero()[:, 0].tolist()
-                raise ValueError(f"the states of rows {rows[:8]} are not finite; look for NaN in what they come from")
+            check_finite(mask.nonzero()[:, 0], qpos[mask], qvel[mask])
         row = mask[:, None]
         for array, value in ((self._qpos, qpos), (self._qvel, qvel), (self._ctrl, joint_position)):
             part = array[:, : value.shape[1]]
@@ -251,13 +245,7 @@ class WarpSimulator:
         self._read()
 
     def place(self, mask: Tensor, position: Tensor, quaternion: Tensor, hinge_angle: Tensor) -> None:
-        """Put the scenery of the rows of a bool mask ``[N]`` somewhere, hinges at rest; other rows are left alone.
-
-        Args:
-            mask: bool ``[N]``.
-            position: ``[N, P, 3]`` [m], one for each piece of :attr:`scenery`, world frame.
-            quaternion: ``[N, P, 4]`` (w, x, y, z).
-            hinge_angle: ``[N, H]`` [rad], one for each piece that has a hinge, in the same order.
+        """Put the scenery of some rows somewhere (:meth:`agility_rl.simulation.Simulator.place`).
 
         Raises:
             ValueError: if a shape is another or, on the CPU, a number is not finite.

@@ -102,3 +102,26 @@ class World:
                 raise ValueError(f"{name} of the scenery must be {list(shape)}, got {list(value.shape)}")
             if finite and not bool(torch.isfinite(value[mask]).all()):
                 raise ValueError(f"{name} of the scenery is not finite; look for NaN in what it comes from")
+
+
+def check_target(target: Tensor, num_simulations: int) -> None:
+    """Refuse joint targets that are not ``[N, 12]``.
+
+    Raises:
+        ValueError: naming both shapes.
+    """
+    shape = (num_simulations, constants.NUM_JOINTS)
+    if tuple(target.shape) != shape:
+        raise ValueError(f"target must be {list(shape)}, got {list(target.shape)}")
+
+
+def check_finite(rows: Tensor, *states: Tensor) -> None:
+    """Refuse states ``[M, ...]`` of rows ``[M]`` with NaN or infinity in them.
+
+    Raises:
+        ValueError: naming the rows.
+    """
+    sound = torch.isfinite(torch.cat(states, -1)).all(-1)
+    if not bool(sound.all()):
+        named = rows[~sound].tolist()
+        raise ValueError(f"the states of rows {named[:8]} are not finite; look for NaN in what they come from")

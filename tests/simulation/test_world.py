@@ -8,7 +8,7 @@ import torch
 
 from agility_rl.go2 import constants
 from agility_rl.simulation import HeightField, Hinge, Piece, Shape
-from agility_rl.simulation.world import FORCES, JOINT_SPEEDS, JOINTS, World
+from agility_rl.simulation.world import FORCES, JOINT_SPEEDS, JOINTS, World, check_finite, check_target
 
 PLANK = Piece("plank", (Shape("sphere", (0.1,)),), Hinge((Shape("box", (1.0, 0.3, 0.02)),), 10.0, (0.0, 0.0, 0.3)))
 STEP = Piece("step", (Shape("box", (0.5, 0.4, 0.1)),))
@@ -55,3 +55,14 @@ def test_places_that_are_none_are_refused() -> None:
     world.check_places(everyone, *places, finite=False)
     with pytest.raises(ValueError, match="hinge_angle of the scenery is not finite"):
         world.check_places(everyone, *places)
+
+
+def test_states_and_targets_are_checked_by_name() -> None:
+    check_target(torch.zeros(2, 12), 2)
+    with pytest.raises(ValueError, match=r"target must be \[3, 12\], got \[2, 12\]"):
+        check_target(torch.zeros(2, 12), 3)
+    position, speed = torch.zeros(2, 3), torch.zeros(2, 4)
+    check_finite(torch.tensor([4, 7]), position, speed)
+    speed[1, 0] = torch.inf
+    with pytest.raises(ValueError, match=r"states of rows \[7\] are not finite"):
+        check_finite(torch.tensor([4, 7]), position, speed)
