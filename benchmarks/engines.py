@@ -22,6 +22,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import mujoco.batch
 import mujoco_warp
 import torch
 import warp
@@ -33,8 +34,8 @@ from agility_rl.behaviours import BEHAVIOURS, NUM_BEHAVIOURS, command_bounds
 from agility_rl.envs import COURSES, LocomotionEnv
 from agility_rl.envs.layout import CourseLayout
 from agility_rl.go2 import constants, features
+from agility_rl.go2.model import build_spec
 from agility_rl.simulation import Simulator, make_simulator, rough_pyramids
-from agility_rl.simulation.warp import WarpSimulator
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 from rollouts import drive, load_controller
@@ -132,33 +133,47 @@ def contenders(args: argparse.Namespace) -> dict[str, Callable[[Tensor], None]]:
     """What is timed: bare engine, simulator and environment of each."""
     found: dict[str, Callable[[Tensor], None]] = {}
     for engine in ("batch", "warp"):
-        bare = make_simulator(num_simulations=args.robots, **options_of(engine, args))
-        found[f"{engine}, bare"] = bare_step(bare)
+        found[f"{engine}, bare"] = bare_step(engine, args)
         found[f"{engine}, simulator"] = make_simulator(num_simulations=args.robots, **options_of(engine, args)).step
         env = LocomotionEnv(args.robots, simulator_options=options_of(engine, args))
         found[f"{engine}, env.step"] = env_step(env)
     return found
 
 
-def bare_step(simulator: Any) -> Callable[[Tensor], None]:
-    """The engine's own physics steps, with targets written as it wants them."""
-    if not isinstance(simulator, WarpSimulator):
-        control = simulator.batch.bind("ctrl")
+def bare_step(engine: str, args: argparse.Namespace) -> Callable[[Tensor], None]:
+    """The engine alone: write the targets, step."""
+    model = build_spec(sim_dt=constants.SIM_DT).compile()
+    substeps = round(constants.CONTROL_DT / constants.SIM_DT)
+    start = [*model.qpos0[:2], constants.STANDING_HEIGHT + 0.005, *model.qpos0[3:7], *constants.DEFAULT_POSE]
+    if engine == "batch":
+        batch = mujoco.batch.Batch(model, args.robots, args.threads)
+        batch.bind("qpos")[:] = start
+        control = batch.bind("ctrl")
 
         def step_batch(target: Tensor) -> None:
             control[:] = target.numpy()
-            simulator.batch.step(nstep=simulator.substeps)
+            batch.step(nstep=substeps)
 
         return step_batch
-    device, model, data = simulator.device, simulator._model, simulator._data
-    control_tensor, graph = warp.to_torch(data.ctrl), simulator._graph
+    device = torch.device(args.device)
+    with warp.ScopedDevice(warp.device_from_torch(device)):
+        there = mujoco_warp.put_model(model)
+        data = mujoco_warp.make_data(model, args.robots, nconmax=48, njmax=306)
+        warp.to_torch(data.qpos).copy_(torch.tensor(start).expand(args.robots, -1))
+        mujoco_warp.step(there, data)  # compiles
+        graph = None
+        if device.type == "cuda":
+            with warp.ScopedCapture() as capture:
+                mujoco_warp.step(there, data)
+            graph = capture.graph
+    command = warp.to_torch(data.ctrl)
 
     def step_warp(target: Tensor) -> None:
-        control_tensor.copy_(target)
+        command.copy_(target)
         with warp.ScopedDevice(warp.device_from_torch(device)):
-            for _ in range(simulator.substeps):
+            for _ in range(substeps):
                 if graph is None:
-                    mujoco_warp.step(model, data)
+                    mujoco_warp.step(there, data)
                 else:
                     warp.capture_launch(graph)
 

@@ -50,3 +50,17 @@ def test_depth_prints_its_rate_beside_bare_rays(repository: Path) -> None:
 def test_control_step_prints_times_and_memory(repository: Path) -> None:
     output = run(repository, "benchmarks/control_step.py", "pretrained/bbc_course", "--steps=20")
     assert "20 control steps" in output and "p99" in output and "memory" in output
+
+
+@pytest.mark.slow
+def test_engines_prints_agreement_and_shares(repository: Path) -> None:
+    options = (
+        "--controller=pretrained/bbc",
+        "--robots=4",
+        "--threads=1",
+        "--episodes=1",
+        "--seconds=0.2",
+        "--rounds=1",
+    )
+    output = run(repository, "benchmarks/engines.py", *options)
+    assert "distance of the trunks" in output and output.count("% of bare") == 6
