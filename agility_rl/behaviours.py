@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from agility_rl.tensors import constant
+
 BEHAVIOURS: tuple[str, ...] = ("walk", "pace", "trot", "canter", "jump")
 """Behaviour names; the position in this tuple is the skill index everywhere in the package."""
 
@@ -64,19 +66,24 @@ def skill_index(name: str) -> int:
         raise ValueError(f"{name!r} is no behaviour; expected one of {', '.join(BEHAVIOURS)}") from None
 
 
-def command_bounds() -> tuple[Tensor, Tensor]:
+_BOUNDS = tuple(
+    tuple(tuple((getattr(row, command) or (0.0, 0.0))[end] for command in COMMANDS) for row in COMMAND_RANGES.values())
+    for end in (0, 1)
+)
+
+
+def command_bounds(device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
     """Lower and upper bound of every command, each ``[5 behaviours, 5 commands]``; unused commands are 0.
+
+    They are shared (:func:`agility_rl.tensors.constant`): never change them in place.
 
     Example:
         >>> low, high = command_bounds()
         >>> round(high[skill_index("canter"), 0].item(), 3)
         2.0
     """
-    rows = [
-        [getattr(COMMAND_RANGES[behaviour], command) or (0.0, 0.0) for command in COMMANDS] for behaviour in BEHAVIOURS
-    ]
-    bounds = torch.tensor(rows)
-    return bounds[..., 0].contiguous(), bounds[..., 1].contiguous()
+    low, high = _BOUNDS
+    return constant(low, torch.device(device)), constant(high, torch.device(device))
 
 
 def sample_commands(skill: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -95,10 +102,10 @@ def sample_commands(skill: Tensor, generator: torch.Generator | None = None) -> 
         >>> sample_commands(torch.tensor([4]))[0, 3] >= 0.45
         tensor(True)
     """
-    low, high = command_bounds()
-    uniform = torch.rand((*skill.shape, len(COMMANDS)), generator=generator)
+    low, high = command_bounds(skill.device)
+    uniform = torch.rand((*skill.shape, len(COMMANDS)), generator=generator, device=skill.device)
     command = low[skill] + (high - low)[skill] * uniform
-    return command.masked_fill(command.abs() < torch.tensor(DEAD_BAND), 0.0)
+    return command.masked_fill(command.abs() < constant(DEAD_BAND, skill.device), 0.0)
 
 
 def commands_from_parameters(skill: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
@@ -118,7 +125,7 @@ def commands_from_parameters(skill: Tensor, parameters: Tensor) -> tuple[Tensor,
         >>> [round(number, 3) for number in command[0].tolist()]  # the middle of a trot
         [1.0, 0.0, 0.0, 0.0, 0.295]
     """
-    low, high = command_bounds()
+    low, high = command_bounds(skill.device)
     parameters = parameters.clamp(-1.0, 1.0)
     command = low[skill] + (high - low)[skill] * (parameters[..., : len(COMMANDS)] + 1.0) / 2.0
     return command, parameters[..., len(COMMANDS) :]

@@ -45,7 +45,7 @@ def demonstration(clip: MotionClip, privileged: Tensor, generator: torch.Generat
     jumping = float(skill == JUMP)
     peak = _pool(height, leap, max_pool1d)
     command = torch.cat((wanted[:, :3], jumping * peak, (1.0 - jumping) * wanted[:, 3:]), -1)
-    shift = 2.0 * torch.rand(frames, 1, generator=generator) - 1.0
+    shift = 2.0 * torch.rand(frames, 1, generator=generator, device=generator.device).to(height.device) - 1.0
     past = max_pool1d(pad(height.T[None], (leap - 1, 0), mode="replicate"), leap, 1)[0].T
     explicit = features.explicit(height, velocity)
     return TensorDict(
@@ -79,25 +79,27 @@ class Demonstrations:
     """
 
     def __init__(self, clips: Sequence[MotionClip], privileged: Tensor, generator: torch.Generator) -> None:
-        self.generator = generator
-        self.data = torch.cat([demonstration(clip, privileged, generator) for clip in clips])
+        self.generator, device = generator, generator.device
+        self.data = torch.cat([demonstration(clip, privileged, generator) for clip in clips]).to(device)
         skill = self.data[keys.COMMAND][:, -NUM_BEHAVIOURS:].argmax(-1)
         self.weight = 1.0 / skill.bincount(minlength=NUM_BEHAVIOURS)[skill]
         spread = [torch.full((entry.size,), STATE_NOISE[entry.name]) for entry in features.PROPRIOCEPTION_LAYOUT]
         rest = torch.zeros(self.data[keys.COMMAND].shape[-1] - len(COMMAND_NOISE))
-        self.noises = {
+        noises = {
             keys.PROPRIOCEPTION: torch.cat(spread),
             keys.ESTIMATE: torch.tensor(ESTIMATE_NOISE),
             keys.COMMAND: torch.cat((torch.tensor(COMMAND_NOISE), rest)),
         }
+        self.noises = {key: noise.to(device) for key, noise in noises.items()}
 
     def sample(self, size: int) -> TensorDict:
         """Draw demonstrations, their inputs blurred by :data:`STATE_NOISE` and its like."""
         sample = self.data[torch.multinomial(self.weight, size, replacement=True, generator=self.generator)]
         for key, noise in self.noises.items():
-            sample[key] = sample[key] + noise * torch.randn(sample[key].shape, generator=self.generator)
+            normal = torch.randn(sample[key].shape, generator=self.generator, device=noise.device)
+            sample[key] = sample[key] + noise * normal
         contact = features.layout_slice(features.PROPRIOCEPTION_LAYOUT, "foot_contact")
-        flipped = torch.rand(size, 4, generator=self.generator) < CONTACT_FLIPS
+        flipped = torch.rand(size, 4, generator=self.generator, device=self.generator.device) < CONTACT_FLIPS
         touched = sample[keys.PROPRIOCEPTION][:, contact]
         sample[keys.PROPRIOCEPTION][:, contact] = torch.where(flipped, -touched, touched)
         return sample

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from hardware import HardwareConfig
+
 from agility_rl.training.precision import Precision
 
 
@@ -176,7 +178,7 @@ class AdaptationConfig:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(HardwareConfig):
     name: str = "bbc"
     """Folder under ``runs``."""
     runs: Path = Path("runs")

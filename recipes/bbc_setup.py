@@ -10,6 +10,7 @@ import torch
 from bbc_cloning import Demonstrations
 from bbc_config import Config
 from bbc_world import load_motion, make_env
+from hardware import training_device
 from held_fixed import INFERRED, privileged_loss
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -89,20 +90,21 @@ class Components:
 
 def build(cfg: Config) -> Components:
     """Construct data, environment, networks, losses and optimisers."""
-    seeds, im, ppo = seed_everything(cfg.seed), cfg.imitation, cfg.ppo
-    dataset = load_motion(cfg.motion, cfg.seed)
+    device, im, ppo = training_device(cfg), cfg.imitation, cfg.ppo
+    seeds = seed_everything(cfg.seed, device)
+    dataset = load_motion(cfg.motion, cfg.seed).to(device)
     env = make_env(cfg, dataset, seeds)
-    bbc = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std)
+    bbc = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std).to(device)
     anchor = None
     if im.anchor:
         if cfg.init_from is None:
             raise ValueError("--imitation.anchor holds on to the policy of --init-from RUN; give both or neither")
-        anchor = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std).requires_grad_(False)
+        anchor = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std).to(device).requires_grad_(False)
         Artifact.load(cfg.init_from, kind="bbc").fill(anchor)
     critic_keys = [keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.COMMAND, keys.PEAK]
     critic_keys += [keys.HISTORY] if ppo.critic_history else []
     width = sum(env.observation_spec[key].shape[1:].numel() for key in critic_keys)
-    critic = Critic(width, in_keys=critic_keys, hidden=ppo.hidden)
+    critic = Critic(width, in_keys=critic_keys, hidden=ppo.hidden).to(device)
     mean, deviation = dataset.statistics()
     height = features.layout_slice(features.MOTION_LAYOUT, "root_height")
     deviation[height].clamp_(min=im.height_deviation)
@@ -116,8 +118,8 @@ def build(cfg: Config) -> Components:
         hidden=im.hidden,
         normalizer=normalizer,
         num_skills=len(BEHAVIOURS) if im.conditional else None,
-    )
-    predictor = Predictor(trunk=discriminator.trunk)
+    ).to(device)
+    predictor = Predictor(trunk=discriminator.trunk).to(device)
     adaptation_loss = AdaptationLoss(bbc.history_encoder, bbc.privileged_encoder)
     heads = {"lr": im.encoder_learning_rate, "weight_decay": im.weight_decay}
     policy_optimizer = torch.optim.Adam(
@@ -172,9 +174,11 @@ def build(cfg: Config) -> Components:
         critic=critic,
         discriminator=discriminator,
         predictor=predictor,
-        prior=SkillPrior(decay=1.0 - im.prior_weight, temperature=im.prior_temperature),
+        prior=SkillPrior(decay=1.0 - im.prior_weight, temperature=im.prior_temperature).to(device),
         replay=TensorDictReplayBuffer(
-            storage=LazyTensorStorage(im.replay), batch_size=im.batch_size, generator=seeds.generator("replay")
+            storage=LazyTensorStorage(im.replay, device=device),
+            batch_size=im.batch_size,
+            generator=seeds.generator("replay"),
         ),
         rollout=rollout,
         advantage=GAE(gamma=ppo.gamma, lmbda=ppo.lmbda, value_network=None, time_dim=0),
@@ -187,7 +191,7 @@ def build(cfg: Config) -> Components:
             keep=["loc", "scale", INFERRED, ANCHORED],
             divergence=divergence,
             schedule=schedule,
-            precision=hidden_precision(ppo.precision),
+            precision=hidden_precision(ppo.precision, device),
         ),
         discriminator_loss=DiscriminatorLoss(
             discriminator, criterion=im.criterion, gradient_penalty=im.gradient_penalty

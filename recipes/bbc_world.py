@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from bbc_config import Config, EnvConfig, MotionConfig
+from hardware import simulator_options
 from identified import load_simulator
 from tensordict import TensorDict
 
@@ -32,6 +33,7 @@ from agility_rl.training.seeding import Seeds
 def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv:
     """Robots that start in the middle of the dogs' motion."""
     reference = starts(cfg, dataset, seeds.generator("reference"))
+    terrain = make_terrain(cfg.env, torch.Generator().manual_seed(seeds.integer("terrain")))
     randomization = Randomization() if cfg.env.randomize else NOMINAL if cfg.env.action_delay else None
     model: dict[str, Any] = {"friction_loss": cfg.env.friction_loss}
     if cfg.env.simulator is not None:
@@ -39,11 +41,7 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
         randomization, model = simulator.randomization, model | dict(simulator.model)
     return LocomotionEnv(
         cfg.env.num_robots,
-        simulator_options={
-            "num_threads": cfg.env.num_threads,
-            **model,
-            "terrain": make_terrain(cfg.env, seeds.generator("terrain")),
-        },
+        simulator_options={**simulator_options(cfg, cfg.env.num_threads), **model, "terrain": terrain},
         reference=reference,
         rewards=rewards(cfg.env),
         terminations=(*LOCOMOTION_TERMINATIONS, *([thigh_contact] if cfg.env.end_when_sitting else [])),
@@ -78,7 +76,7 @@ def starts(cfg: Config, dataset: MotionDataset, generator: torch.Generator, each
     if not 0.0 <= cfg.env.standing_starts <= 1.0:
         raise ValueError(f"--env.standing-starts: expected a share from 0 to 1, got {cfg.env.standing_starts}")
     standing = round(each * cfg.env.standing_starts)
-    skills = torch.arange(len(BEHAVIOURS))
+    skills = torch.arange(len(BEHAVIOURS), device=generator.device)
     moving = skills.repeat_interleave(each - standing)
     states = dataset.sample_states(moving, generator).set("skill", moving)
     return torch.cat((states, standing_states(skills.repeat_interleave(standing), cfg.motion.offsets[-1])))

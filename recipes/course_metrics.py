@@ -22,7 +22,8 @@ def judge(env: AgilityEnv, curriculum: Curriculum, batch: TensorDictBase) -> dic
     passed = outcome["passed"].flatten(0, 1).sum(0).float()
     failed = (outcome["failed"] | outcome["bypassed"]).flatten(0, 1).sum(0).float()
     counts = distributed.total(torch.tensor([successes, episodes]))
-    curriculum.update(distributed.total(passed), distributed.total(failed), int(counts[0]), int(counts[1]))
+    passed, failed = (distributed.total(number).cpu() for number in (passed, failed))
+    curriculum.update(passed, failed, int(counts[0]), int(counts[1]))
     rate = curriculum.passed / (curriculum.passed + curriculum.failed)
     metrics: dict[str, Tensor | float] = {"episodes": float(episodes)}
     if episodes:

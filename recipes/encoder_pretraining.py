@@ -21,6 +21,7 @@ from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2.camera import dequantize
 from agility_rl.modules.mlp import mlp
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
+from agility_rl.training.seeding import permutation
 
 
 @torch.no_grad()
@@ -39,7 +40,7 @@ def collect_images(parts: Components, cfg: Config) -> TensorDictBase:
         TensorDictSequential(*parts.teacher.privileged_policy(), remember),
         parts.teacher.privileged_policy(),
         own.every,
-        initial_hidden=torch.zeros(env.num_robots, 1),
+        initial_hidden=torch.zeros(env.num_robots, 1, device=env.device),
         bits=cfg.bits,
         keep=(keys.DEPTH, keys.SCANDOTS, keys.OBSTACLE),
     )
@@ -71,7 +72,7 @@ def pretrain(
     robots = images.batch_size[1]
     apart = min(max(1, round(own.held_out * robots)), robots - 1)
     train, test = images[:, apart:].flatten(), images[:, :apart].flatten()
-    head = mlp(32, (), NUM_TERRAIN_LATENT + len(OBSTACLES))
+    head = mlp(32, (), NUM_TERRAIN_LATENT + len(OBSTACLES)).to(parts.env.device)
     encoder = parts.student.depth_encoder.module
     optimizer = torch.optim.Adam([*encoder.parameters(), *head.parameters()], lr=own.learning_rate)
 
@@ -83,7 +84,7 @@ def pretrain(
 
     metrics: dict[str, float] = {"pretrain/images": float(len(train))}
     for epoch in range(own.epochs):
-        for rows in torch.randperm(len(train), generator=generator).split(own.batch):
+        for rows in permutation(len(train), generator).split(own.batch):
             sample = train[rows]
             latent, obstacle, _ = errors(sample, parts.augmentation.augment(dequantize(sample[keys.DEPTH])))
             optimizer.zero_grad(set_to_none=True)
@@ -93,11 +94,9 @@ def pretrain(
                 metrics |= {f"pretrain/{name}": value.item() for name, value in represent(sample[keys.DEPTH]).items()}
         with torch.no_grad():
             pieces = [(len(part), *errors(part, part[keys.DEPTH])) for part in test.split(own.batch)]
-        weights = torch.tensor([float(piece[0]) for piece in pieces])
-        values = torch.tensor([[float(value) for value in piece[1:]] for piece in pieces])
-        means = (weights[:, None] * values).sum(0) / weights.sum()
         names = ("pretrain/error_latent", "pretrain/loss_obstacle", "pretrain/accuracy_obstacle")
-        metrics |= dict(zip(names, means.tolist(), strict=True))
+        for index, name in enumerate(names, start=1):
+            metrics[name] = sum(piece[0] * float(piece[index]) for piece in pieces) / len(test)
         shown = "  ".join(f"{name.removeprefix('pretrain/')} {metrics[name]:.3g}" for name in names)
         print(f"pre-training {epoch + 1}/{own.epochs} on {len(train)} images; {len(test)} held out: {shown}")
     return metrics

@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 from agility_rl import keys
 from agility_rl.losses import AdaptationLoss
 from agility_rl.training import distributed
+from agility_rl.training.seeding import permutation
 
 INFERRED = "inferred_latent"
 """Latent that the history encoder infers, float32 ``[T, N, 29]``, in collected experience."""
@@ -47,7 +48,7 @@ def fit(
     names = dict.fromkeys(key for loss in losses for key in loss.in_keys)
     flat = batch.select(*names).flatten()
     metrics: dict[str, Tensor] = {}
-    for rows in torch.randperm(flat.numel(), generator=generator).chunk(minibatches):
+    for rows in permutation(flat.numel(), generator).chunk(minibatches):
         found = [dict(loss(flat[rows]).items()) for loss in losses]
         optimizer.zero_grad(set_to_none=True)
         torch.stack([result[loss.out_keys[0]] for loss, result in zip(losses, found, strict=True)]).sum().backward()

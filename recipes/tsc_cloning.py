@@ -18,6 +18,7 @@ from tsc_script import Script
 from tsc_setup import Components
 
 from agility_rl import keys
+from agility_rl.training.seeding import permutation
 
 READ = (keys.OBSTACLE, keys.HEADING_ERROR)
 """What a script reads."""
@@ -45,7 +46,7 @@ def clone(parts: Components, cfg: CloningConfig) -> dict[str, float]:
         batch = parts.rollout.collect(policy).select(*actor.in_keys, *READ).flatten()
         label = targets(script.decide(batch.select(*READ))[keys.ACTION], before(batch.clone()), cfg.smoothing, allowed)
         for _ in range(cfg.epochs):
-            for rows in torch.randperm(len(batch), generator=parts.generator).chunk(cfg.minibatches):
+            for rows in permutation(len(batch), parts.generator).chunk(cfg.minibatches):
                 losses = imitation(networks(batch[rows]), label[rows])
                 optimizer.zero_grad(set_to_none=True)
                 torch.stack(tuple(losses.values())).sum().backward()

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from hardware import HardwareConfig
+
 from agility_rl.training.precision import Precision
 
 
@@ -64,6 +66,7 @@ class PPOConfig:
     initial_std: float = 1.0
     """At the start; a teacher of ``--init-from`` that has more begins with this."""
     min_std: float = 0.1
+    """Floor. A decision is held for ``decision_steps`` only, so that a small deviation hardly moves the robot."""
     hidden: tuple[int, ...] = (512, 256, 128)
     """Supplement S6."""
     critic_warm_up: int = 0
@@ -93,7 +96,8 @@ class CloningConfig:
     """Roll-outs in which the teacher copies a script before it learns by itself (ours; 0: not at all)."""
     script: str = "trot:1.2"
     """BEHAVIOUR:SPEED, and OBSTACLE=BEHAVIOUR:SPEED after commas, as ``evaluate_course.py --script`` takes it. With
-    ``own`` in place of the first, a teacher of ``--init-from`` is corrected before those and keeps the rest."""
+    ``own`` in place of the first, a teacher of ``--init-from`` is corrected before those and keeps the rest;
+    ``own/trot:0.6`` corrects it only while the way-point is more than 0.5 rad aside."""
     scripted: float = 0.5
     """Share of the robots that the script drives meanwhile; the teacher sees where its own choices lead with the
     rest, and is told there too what the script would do."""
@@ -131,7 +135,7 @@ class CurriculumConfig:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(HardwareConfig):
     name: str = "teacher"
     """Folder under ``runs``."""
     runs: Path = Path("runs")

@@ -57,7 +57,7 @@ class Curriculum:
     def start_weights(self, types: Tensor) -> Tensor:
         """``[K]``, how often to start before each obstacle, from one-hot types ``[K, 7]``."""
         rate = self.passed / (self.passed + self.failed)
-        return 1.0 + self.cfg.practice * ((1.0 - rate) / rate.clamp(min=0.1))[types.float().argmax(-1)]
+        return 1.0 + self.cfg.practice * ((1.0 - rate) / rate.clamp(min=0.1))[types.float().argmax(-1).cpu()]
 
     def state_dict(self) -> dict[str, Any]:
         """Where it stands."""

@@ -19,16 +19,19 @@ STEERING = 2.0
 """Turn rate that is commanded for each radian of heading error [1/s]."""
 OWN = "own"
 """In place of a decision: the teacher decides as it did before, and the script says nothing."""
+ASIDE = 0.5
+"""Heading error from which the second decision of ``FIRST/SECOND`` holds [rad]."""
 TURN = behaviours.COMMANDS.index("yaw_rate")
 
 
 @dataclass(frozen=True)
 class Script:
-    """A behaviour and a speed for each type of obstacle.
+    """A behaviour and a speed for each type of obstacle, straight ahead and while the way-point is aside.
 
     Attributes:
-        skill: int64 ``[7]``, behaviour before each of :data:`OBSTACLES`; -1 where it says nothing.
-        parameters: ``[7, 5, 6]``, forward speed of the chosen behaviour, everything else in the middle of its range.
+        skill: int64 ``[2, 7]``, behaviour before each of :data:`OBSTACLES`; -1 where it says nothing. The second row
+            holds while the way-point is more than :data:`ASIDE` off the heading.
+        parameters: ``[2, 7, 5, 6]``, forward speed of the chosen behaviour, everything else in the middle of its range.
     """
 
     skill: Tensor
@@ -38,23 +41,26 @@ class Script:
     def parse(cls, text: str, option: str = "--script") -> Script:
         """Read ``BEHAVIOUR:SPEED``, speed in m/s, and after commas what differs, ``OBSTACLE=BEHAVIOUR:SPEED``.
 
-        ``own`` in place of the first says something about the others only.
+        ``FIRST/SECOND`` in place of a decision turns by the second towards way-points that are far aside, as a canter
+        cannot. ``own`` in place of a decision says nothing.
 
         Raises:
             ValueError: if it is no such text, there is no such obstacle, or the behaviour has no such speed.
         """
         usual, *others = text.split(",")
-        chosen = dict.fromkeys(OBSTACLES, (-1, 0.0) if usual == OWN else _read(usual, text, option))
+        chosen = dict.fromkeys(OBSTACLES, _read_pair(usual, text, option))
         for other in others:
             name, _, decision = other.partition("=")
             if name not in OBSTACLES:
                 raise ValueError(f"{option}: unknown obstacle {name!r} in {text!r}, expected {', '.join(OBSTACLES)}")
-            chosen[name] = _read(decision, text, option)
-        parameters = torch.zeros(len(OBSTACLES), behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS)
-        for row, (skill, speed) in enumerate(chosen.values()):
-            if skill >= 0:
-                parameters[row, skill, 0] = speed
-        return cls(torch.tensor([skill for skill, _ in chosen.values()]), parameters)
+            chosen[name] = _read_pair(decision, text, option)
+        skill = torch.tensor([[skill for skill, _ in pair] for pair in chosen.values()]).T
+        parameters = torch.zeros(2, len(OBSTACLES), behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS)
+        for row, pair in enumerate(chosen.values()):
+            for case, (index, speed) in enumerate(pair):
+                if index >= 0:
+                    parameters[case, row, index, 0] = speed
+        return cls(skill, parameters)
 
     @property
     def behaviours(self) -> tuple[str, ...]:
@@ -69,17 +75,26 @@ class Script:
     def decide(self, td: TensorDictBase) -> TensorDictBase:
         """Decisions of ``N`` robots under ``action``; each behaviour's turn rate leads to the way-point. Where it says
         nothing, the behaviour is -1."""
-        kind = td[keys.OBSTACLE].argmax(-1)
-        _, fastest = behaviours.command_bounds()
-        parameters = self.parameters[kind].clone()
-        turn = STEERING * td[keys.HEADING_ERROR][:, :1] / fastest[:, TURN]
-        parameters[..., TURN] = turn.clamp(-1.0, 1.0)
-        decision = {keys.BEHAVIOUR: self.skill[kind], keys.PARAMETERS: parameters}
+        kind, error = td[keys.OBSTACLE].argmax(-1), td[keys.HEADING_ERROR][:, :1]
+        case = (error[:, 0].abs() > ASIDE).long()
+        _, fastest = behaviours.command_bounds(kind.device)
+        parameters = self.parameters.to(kind.device)[case, kind]
+        parameters[..., TURN] = (STEERING * error / fastest[:, TURN]).clamp(-1.0, 1.0)
+        decision = {keys.BEHAVIOUR: self.skill.to(kind.device)[case, kind], keys.PARAMETERS: parameters}
         return td.set(keys.ACTION, TensorDict(decision, td.batch_size))
 
 
+def _read_pair(decision: str, text: str, option: str) -> tuple[tuple[int, float], tuple[int, float]]:
+    """What to do straight ahead, and while the way-point is aside."""
+    first, slash, second = decision.partition("/")
+    ahead = _read(first, text, option)
+    return ahead, _read(second, text, option) if slash else ahead
+
+
 def _read(decision: str, text: str, option: str) -> tuple[int, float]:
-    """Behaviour and the parameter that stands for its speed."""
+    """Behaviour and the parameter that stands for its speed; -1 for ``own``."""
+    if decision == OWN:
+        return -1, 0.0
     name, _, number = decision.partition(":")
     try:
         skill, speed = behaviours.skill_index(name), float(number)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+from hardware import simulator_options, training_device
 from held_fixed import INFERRED, privileged_loss
 from rollouts import Controller, load_controller
 from tensordict import TensorDictBase
@@ -79,7 +80,8 @@ class Components:
 
 def build(cfg: Config) -> Components:
     """Construct course, environment, networks, losses and optimisers."""
-    seeds, ppo = seed_everything(cfg.seed), cfg.ppo
+    device, ppo = training_device(cfg), cfg.ppo
+    seeds = seed_everything(cfg.seed, device)
     controller = load_controller(cfg.bbc)
     discriminator, offsets = load_discriminator(controller.run, cfg.reward.imitation > 0.0)
     env = make_env(
@@ -87,15 +89,16 @@ def build(cfg: Config) -> Components:
         controller,
         cfg.env.course,
         cfg.env.decision_steps,
+        simulator_options(cfg, cfg.env.num_threads),
         seed=seeds.integer("environment"),
         motion_offsets=offsets,
         rewards=rewards(cfg.reward),
     )
     allowed = None if set(cfg.behaviours) == set(BEHAVIOURS) else sorted(skill_index(name) for name in cfg.behaviours)
-    teacher = Teacher(len(OBSTACLES), ppo.hidden, ppo.initial_std, ppo.min_std, allowed)
+    teacher = Teacher(len(OBSTACLES), ppo.hidden, ppo.initial_std, ppo.min_std, allowed).to(device)
     teacher.estimator.load_state_dict(controller.bbc.estimator.state_dict())  # method notes, section 5.3
     width = sum(env.observation_spec[key].shape[1:].numel() for key in OBSERVED)
-    critic = Critic(width, in_keys=list(OBSERVED), hidden=ppo.hidden)
+    critic = Critic(width, in_keys=list(OBSERVED), hidden=ppo.hidden).to(device)
     trained = teacher.trained_actor()
     policy_optimizer = torch.optim.Adam(
         [
@@ -128,7 +131,7 @@ def build(cfg: Config) -> Components:
         env=env,
         teacher=teacher,
         critic=critic,
-        discriminator=discriminator,
+        discriminator=None if discriminator is None else discriminator.to(device),
         curriculum=Curriculum.start(cfg.curriculum, env),
         rollout=Rollout(
             env,
@@ -153,21 +156,27 @@ def build(cfg: Config) -> Components:
             keep=["logits", "loc", "scale", INFERRED],
             divergence=divergence,
             schedule=schedule,
-            precision=hidden_precision(ppo.precision),
+            precision=hidden_precision(ppo.precision, device),
         ),
         bbc=controller,
     )
 
 
 def make_env(
-    robots: RobotsConfig, controller: Controller, course: str, decision_steps: int, **options: Any
+    robots: RobotsConfig,
+    controller: Controller,
+    course: str,
+    decision_steps: int,
+    engine: Mapping[str, Any],
+    **options: Any,
 ) -> AgilityEnv:
-    """A course for training, with the frozen controller in it."""
+    """A course for training, with the frozen controller in it, on the engine's device."""
+    controller.bbc.to(engine.get("device", "cpu"))
     return AgilityEnv(
         robots.num_robots,
         frozen(controller),
         course_of(course),
-        simulator_options={"num_threads": robots.num_threads, "friction_loss": controller.friction_loss},
+        simulator_options={**engine, "friction_loss": controller.friction_loss},
         decision_steps=decision_steps,
         command_noise=robots.command_noise,
         randomization=COURSE_RANDOMIZATION if robots.randomize else None,

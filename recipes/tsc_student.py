@@ -41,6 +41,7 @@ from agility_rl import keys
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2.camera import dequantize
 from agility_rl.training import cli, distributed
+from agility_rl.training.seeding import permutation
 
 HEADLINE: tuple[str, ...] = ("time/minutes", "success", "episodes", "falls_per_minute")
 HEADLINE += ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_byol", "spread")
@@ -53,7 +54,7 @@ def imitate(parts: Components, cfg: Config, window: TensorDictBase, iteration: i
     own = cfg.imitation
     found: list[TensorDictBase] = []
     for _ in range(own.epochs):
-        for rows in torch.randperm(window.shape[1], generator=parts.generator).chunk(own.minibatches):
+        for rows in permutation(window.shape[1], parts.generator).chunk(own.minibatches):
             sample = window[:, rows]
             if own.augment:
                 sample[keys.DEPTH] = parts.augmentation.augment(dequantize(sample[keys.DEPTH]))
@@ -86,7 +87,7 @@ def represent(parts: Components, iteration: int, images: Tensor) -> dict[str, Te
 def represent_window(parts: Components, cfg: Config, window: TensorDictBase, iteration: int) -> dict[str, Tensor]:
     """BYOL on images drawn from a window; returns the means."""
     images, own = window[keys.DEPTH].flatten(0, 1), cfg.representation
-    chosen = torch.randperm(len(images), generator=parts.generator)[: own.images]
+    chosen = permutation(len(images), parts.generator)[: own.images]
     found = [represent(parts, iteration, images[rows]) for rows in chosen.chunk(own.minibatches)]
     return {name: torch.stack([losses[name] for losses in found]).mean() for name in found[0]}
 

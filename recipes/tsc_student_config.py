@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from hardware import HardwareConfig
 from tsc_config import CurriculumConfig, RobotsConfig
 
 from agility_rl.go2 import camera
@@ -114,7 +115,7 @@ class PretrainConfig:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(HardwareConfig):
     name: str = "student"
     """Folder under ``runs``."""
     runs: Path = Path("runs")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hardware import simulator_options, training_device
 from rollouts import Controller
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
@@ -99,8 +100,9 @@ def resolve(cfg: Config) -> tuple[Config, Trained]:
 
 def build(cfg: Config, trained: Trained) -> Components:
     """Construct course, student, losses and optimisers, from options that :func:`resolve` has completed."""
-    seeds = seed_everything(cfg.seed)
-    teacher = trained.network
+    device = training_device(cfg)
+    seeds = seed_everything(cfg.seed, device)
+    teacher = trained.network.to(device)
     assert isinstance(teacher, Teacher) and cfg.env.course is not None
     teacher.requires_grad_(False)
     controller = load_bbc_of(trained, cfg.bbc)
@@ -109,17 +111,18 @@ def build(cfg: Config, trained: Trained) -> Components:
         controller,
         cfg.env.course,
         trained.decision_steps,
+        simulator_options(cfg, cfg.env.num_threads),
         goal_radius=cfg.env.goal_radius,
         depth=asdict(cfg.camera),
         seed=seeds.integer("environment"),
     )
     student = RecurrentStudent.from_teacher(
         teacher, memory=cfg.memory, encoder_hidden=cfg.encoder_hidden, heading_gate=cfg.heading_gate
-    )
+    ).to(device)
     student.estimator.requires_grad_(False)  # it estimates what can be measured: imitation shall not bend it
     # A tenth to a third less time for the convolutions on a CPU.
     student.depth_encoder.to(memory_format=torch.channels_last)
-    student.depth_encoder.module.precision = hidden_precision(cfg.precision)
+    student.depth_encoder.module.precision = hidden_precision(cfg.precision, device)
     imitation = cfg.imitation
     return Components(
         seeds=seeds,
@@ -163,7 +166,8 @@ def make_augmentation(cfg: AugmentationConfig, generator: torch.Generator) -> De
 def make_representation(cfg: Config, student: RecurrentStudent) -> Representation:
     """BYOL around the encoder of a student."""
     own = cfg.representation
-    loss = BYOLLoss(BYOL(student.depth_encoder, hidden=own.hidden, out_features=own.out_features))
+    byol = BYOL(student.depth_encoder, hidden=own.hidden, out_features=own.out_features)
+    loss = BYOLLoss(byol.to(next(student.parameters()).device))
     parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
     return Representation(loss, SoftUpdate(loss, eps=own.decay), torch.optim.Adam(parameters, lr=own.learning_rate))
 

@@ -95,8 +95,9 @@ def begin(parts: Components, cfg: Config) -> None:
     """Where a new run starts from: another run's teacher, a copied script, or the one corrected by the other."""
     if cfg.init_from is not None:
         Artifact.load(cfg.init_from, kind="teacher").fill(parts.teacher)
-        deviation = parts.teacher.actor.network.parameters_head.std.data
-        deviation.clamp_(max=cfg.ppo.initial_std)
+        head = parts.teacher.actor.network.parameters_head
+        head.min_std.fill_(cfg.ppo.min_std)
+        head.std.data.clamp_(cfg.ppo.min_std, cfg.ppo.initial_std)
     if copies(cfg):
         set_course(parts.env, parts.curriculum)
         clone(parts, cfg.cloning)

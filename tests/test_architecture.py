@@ -13,11 +13,12 @@ import pytest
 REPOSITORY = Path(__file__).parents[1]
 PACKAGE = REPOSITORY / "agility_rl"
 
-GROUND = {"keys", "behaviours", "rotations", "bending"}
+GROUND = {"keys", "behaviours", "rotations", "bending", "tensors"}
 MAY_IMPORT: dict[str, set[str]] = {
     "": set(),
     "keys": set(),
-    "behaviours": set(),
+    "tensors": set(),
+    "behaviours": {"tensors"},
     "rotations": set(),
     "bending": set(),
     "go2": GROUND,

@@ -140,7 +140,7 @@ class DAggerCollector:
         return window.set(self.hidden_key, hidden.expand(self.num_steps, *hidden.shape))
 
     def _begin(self) -> TensorDictBase:
-        first = torch.ones(len(self._initial_hidden), 1, dtype=torch.bool)
+        first = torch.ones(len(self._initial_hidden), 1, dtype=torch.bool, device=self._initial_hidden.device)
         return self._carry(self.env.reset(), self._initial_hidden, first)
 
     def _carry(self, observation: TensorDictBase, hidden: Tensor, is_init: Tensor) -> TensorDictBase:

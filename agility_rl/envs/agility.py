@@ -21,6 +21,7 @@ from agility_rl.envs.course import Course
 from agility_rl.envs.course_presets import full_course
 from agility_rl.envs.decisions import COMMAND_NOISE, NUM_PARAMETERS, Decisions
 from agility_rl.envs.depth import DepthObservation
+from agility_rl.envs.layout import scenery
 from agility_rl.envs.observations import ObservationGroups
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.envs.outcome import DecisionOutcome, outcome_specs
@@ -122,21 +123,20 @@ class AgilityEnv(EnvBase):
         depth: Mapping[str, Any] | None = None,
         seed: int = 0,
     ) -> None:
-        super().__init__(device="cpu", batch_size=torch.Size([num_robots]))
-        self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
         if decision_steps < 1:
             raise ValueError(f"decision_steps must be at least 1, got {decision_steps}")
-        self.generator = torch.Generator().manual_seed(seed)
         course = full_course() if course is None else course
+        pieces = scenery(course)
+        simulator = simulator or make_simulator(num_simulations=num_robots, scenery=pieces, **(simulator_options or {}))
+        super().__init__(device=simulator.device, batch_size=torch.Size([num_robots]))
+        self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
+        self.simulator = simulator
+        self.generator = torch.Generator(simulator.device).manual_seed(seed)
         self.arena = Arena(course, num_robots, self.generator, goal_radius, start, start_spread)
-        pieces = self.arena.layout.pieces
-        self.simulator = simulator or make_simulator(
-            num_simulations=num_robots, scenery=pieces, **(simulator_options or {})
-        )
         if self.simulator.num_simulations != num_robots:
             raise ValueError(f"the simulator holds {self.simulator.num_simulations} robots, expected {num_robots}")
         if tuple(self.simulator.scenery) != pieces:
-            raise ValueError(f"the simulator must hold the scenery of course {course.name!r}: CourseLayout(...).pieces")
+            raise ValueError(f"the simulator must hold scenery(course) of {course.name!r} (agility_rl.envs.layout)")
         self.controller = controller
         self.dt = self.simulator.control_dt
         self.decision_steps = decision_steps
@@ -154,7 +154,7 @@ class AgilityEnv(EnvBase):
         if depth is not None:
             self.depth = DepthObservation(self.simulator, self.generator, decision_steps, **depth)
         self._robot = self.robots.state(self.robots.action, self.decisions.commands)
-        self._step_count = torch.zeros(num_robots, dtype=torch.int64)
+        self._step_count = torch.zeros(num_robots, dtype=torch.int64, device=self.device)
         self._make_specs(num_robots)
 
     def _make_specs(self, n: int) -> None:
@@ -222,7 +222,7 @@ class AgilityEnv(EnvBase):
             self.generator.manual_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = torch.ones(self.num_robots, dtype=torch.bool)
+        mask = torch.ones(self.num_robots, dtype=torch.bool, device=self.device)
         if tensordict is not None and (chosen := tensordict.get("_reset", None)) is not None:
             mask = chosen.reshape(self.num_robots)
         self.arena.begin(mask, self.simulator)
@@ -247,7 +247,7 @@ class AgilityEnv(EnvBase):
         return self._observe(outcome)
 
     def _outcome(self) -> DecisionOutcome:
-        return DecisionOutcome(self.num_robots, (*self.rewards, TERMINATION_TERM), self.terminations)
+        return DecisionOutcome(self.num_robots, (*self.rewards, TERMINATION_TERM), self.terminations, self.device)
 
     def _advance(self, outcome: DecisionOutcome) -> None:
         """One control step of all robots."""

@@ -18,6 +18,7 @@ from agility_rl.envs.robots import CLEARANCE
 from agility_rl.envs.scandots import HeightScan
 from agility_rl.go2 import constants
 from agility_rl.simulation import Simulator
+from agility_rl.tensors import constant
 
 START_BEHIND, START_ASIDE, START_TURN = 0.2, 0.1, 0.2
 """Draw of the start: 0 to 0.2 m behind the first way-point, +-0.1 m beside it, +-0.2 rad (method notes, 5.7)."""
@@ -65,14 +66,14 @@ class Arena:
         self.layout = CourseLayout(course, num_robots, generator)
         self.progress = CourseProgress(self.layout, goal_radius)
         self.scan = HeightScan(self.layout)
-        kinds = self.layout.kinds
+        kinds, device = self.layout.kinds, generator.device
         self.max_obstacles = len(kinds)
-        self.start_weights = torch.ones(len(kinds))
+        self.start_weights = torch.ones(len(kinds), device=device)
         names = list(OBSTACLES)
         self.types = torch.nn.functional.one_hot(
-            torch.tensor([names.index(kind.name) for kind in kinds]), len(names)
+            torch.tensor([names.index(kind.name) for kind in kinds], device=device), len(names)
         ).bool()
-        self._speeds = torch.tensor([kind.target_speed for kind in kinds])
+        self._speeds = torch.tensor([kind.target_speed for kind in kinds], device=device)
 
     def set_curriculum(self, difficulty: float | None, obstacles: int | None, start_weights: Tensor | None) -> None:
         """Change what later episodes draw; what is ``None`` stays as it is.
@@ -92,36 +93,37 @@ class Arena:
         if start_weights is not None:
             if start_weights.shape != (count,) or not bool((start_weights > 0.0).all()):
                 raise ValueError(f"start_weights must be {count} positive numbers, got {start_weights.tolist()}")
-            self.start_weights = start_weights.detach().clone()
+            self.start_weights = start_weights.detach().to(self.start_weights.device, copy=True)
 
     def begin(self, mask: Tensor, simulator: Simulator) -> None:
         """Draw the courses of the rows of a bool mask ``[N]`` and stand their robots before an obstacle."""
-        n = len(mask)
+        n, device = len(mask), mask.device
         self.layout.draw(mask)
         simulator.place(mask, *self.layout.poses())
         length = self.layout.length
-        leg = torch.zeros(n, dtype=torch.int64)
+        leg = torch.zeros(n, dtype=torch.int64, device=device)
         if self.random_start:
-            valid = torch.arange(self.layout.route.shape[1]) < length[:, None]
+            valid = torch.arange(self.layout.route.shape[1], device=device) < length[:, None]
             weights = self.start_weights[self.layout.route] * valid
             leg = torch.multinomial(weights, 1, generator=self.generator)[:, 0]
         self.progress.begin(mask, leg, torch.minimum(leg + self.max_obstacles, length))
 
-        behind, aside, turn = torch.rand(3, n, generator=self.generator)
+        behind, aside, turn = torch.rand(3, n, generator=self.generator, device=device)
         spread = self.start_spread
         shift = torch.stack((-START_BEHIND * behind, spread * START_ASIDE * (2.0 * aside - 1.0)), -1)
         obstacle = self.progress.obstacle
         place = self.layout.world(obstacle, self.progress.local_goal() + shift)
-        yaw = self.layout.yaw[torch.arange(n), obstacle] + spread * START_TURN * (2.0 * turn - 1.0)
+        yaw = self.layout.yaw.gather(1, obstacle[:, None])[:, 0] + spread * START_TURN * (2.0 * turn - 1.0)
         height = self.ground(place, simulator)[:, None] + constants.STANDING_HEIGHT + CLEARANCE
+        level, still = torch.zeros_like(yaw), torch.zeros(n, 3, device=device)
         simulator.reset(
             mask,
             root_position=torch.cat((place, height), -1),
-            root_quaternion=rotations.from_euler(torch.zeros(n), torch.zeros(n), yaw),
-            root_linear_velocity=torch.zeros(n, 3),
-            root_angular_velocity=torch.zeros(n, 3),
-            joint_position=torch.tensor(constants.DEFAULT_POSE).repeat(n, 1),
-            joint_velocity=torch.zeros(n, constants.NUM_JOINTS),
+            root_quaternion=rotations.from_euler(level, level, yaw),
+            root_linear_velocity=still,
+            root_angular_velocity=still,
+            joint_position=constant(constants.DEFAULT_POSE, device).repeat(n, 1),
+            joint_velocity=torch.zeros(n, constants.NUM_JOINTS, device=device),
         )
         self.progress.locate(mask, place)
 

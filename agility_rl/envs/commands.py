@@ -37,13 +37,13 @@ class CommandSampler:
     """
 
     def __init__(self, num_robots: int, generator: torch.Generator, period: int | None) -> None:
-        self.generator = generator
-        self.period = period
-        self.skill = torch.zeros(num_robots, dtype=torch.int64)
-        self.shift = torch.zeros(num_robots, 1)
-        self.command = torch.zeros(num_robots, len(behaviours.COMMANDS))
-        self.age = torch.zeros(num_robots, dtype=torch.int64)
-        self.probabilities = torch.full((behaviours.NUM_BEHAVIOURS,), 1.0 / behaviours.NUM_BEHAVIOURS)
+        self.generator, device = generator, generator.device
+        self.period, number = period, behaviours.NUM_BEHAVIOURS
+        self.skill = torch.zeros(num_robots, dtype=torch.int64, device=device)
+        self.shift = torch.zeros(num_robots, 1, device=device)
+        self.command = torch.zeros(num_robots, len(behaviours.COMMANDS), device=device)
+        self.age = torch.zeros(num_robots, dtype=torch.int64, device=device)
+        self.probabilities = torch.full((number,), 1.0 / number, device=device)
 
     @property
     def jumping(self) -> Tensor:
@@ -57,7 +57,7 @@ class CommandSampler:
             return
         skill = torch.multinomial(self.probabilities, len(rows), replacement=True, generator=self.generator)
         command = behaviours.sample_commands(skill, self.generator)
-        shift = 2.0 * torch.rand(len(rows), 1, generator=self.generator) - 1.0
+        shift = 2.0 * torch.rand(len(rows), 1, generator=self.generator, device=skill.device) - 1.0
         self.assign(mask, skill, command, shift)
 
     def assign(self, mask: Tensor, skill: Tensor, command: Tensor, shift: Tensor) -> None:

@@ -43,18 +43,19 @@ class Decisions:
     def __init__(self, num_robots: int, generator: torch.Generator, noise: tuple[float, float] = COMMAND_NOISE) -> None:
         if not 0.0 <= noise[0] <= noise[1]:
             raise ValueError(f"command noise must be (low, high) with 0 <= low <= high, got {noise}")
-        self.generator, self.noise = generator, noise
+        self.generator, self.noise, device = generator, noise, generator.device
         self.commands = CommandSampler(num_robots, generator, period=None)
-        self.behaviours = torch.zeros(num_robots, 3, dtype=torch.int64)
-        self.parameters = torch.zeros(num_robots, 2, behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS)
-        self.applied = torch.zeros(num_robots, 2, NUM_PARAMETERS)
-        self.fresh = torch.ones(num_robots, dtype=torch.bool)
+        self.behaviours = torch.zeros(num_robots, 3, dtype=torch.int64, device=device)
+        self.parameters = torch.zeros(num_robots, 2, behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS, device=device)
+        self.applied = torch.zeros(num_robots, 2, NUM_PARAMETERS, device=device)
+        self.fresh = torch.ones(num_robots, dtype=torch.bool, device=device)
 
     def begin(self, mask: Tensor) -> None:
         """Forget the past of the rows of a bool mask ``[N]``: their next decision changes nothing."""
         rows = int(mask.sum())
-        none = torch.zeros(rows, len(behaviours.COMMANDS))
-        self.commands.assign(mask, torch.zeros(rows, dtype=torch.int64), none, torch.zeros(rows, 1))
+        skill = torch.zeros(rows, dtype=torch.int64, device=mask.device)
+        none = torch.zeros(rows, len(behaviours.COMMANDS) + 1, device=mask.device)
+        self.commands.assign(mask, skill, none[:, 1:], none[:, :1])
         self.fresh = self.fresh | mask
 
     def decide(self, behaviour: Tensor, parameters: Tensor) -> None:
@@ -63,7 +64,8 @@ class Decisions:
         command, shift = behaviours.commands_from_parameters(behaviour, chosen)
         low, high = self.noise
         if low != high:
-            command = command * (low + (high - low) * torch.rand(command.shape, generator=self.generator))
+            factor = torch.rand(command.shape, generator=self.generator, device=command.device)
+            command = command * (low + (high - low) * factor)
         self.commands.assign(torch.ones_like(self.fresh), behaviour, command, shift)
         news = {"behaviours": behaviour, "parameters": parameters, "applied": chosen}
         for name, new in news.items():

@@ -63,21 +63,21 @@ class DepthObservation:
             raise ValueError(f"latency must be (fewest, most) control steps from 0 on, got {latency}")
         if min(pitch, offset_noise, pixel_noise) < 0.0:
             raise ValueError(f"pitch and noise must not be negative, got {pitch}, {offset_noise}, {pixel_noise}")
-        n = simulator.num_simulations
+        n, device = simulator.num_simulations, simulator.device
         self.generator, self.camera = generator, simulator.make_camera()
         self.decision_steps, self.frame_steps, self.latency = decision_steps, frame_steps, latency
         self.pitch, self.offset_noise, self.pixel_noise = pitch, offset_noise, pixel_noise
         kept = math.ceil(latency[1] / max(decision_steps, frame_steps)) + 1
-        self._frames = torch.zeros(n, kept, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)  # newest last
-        self._taken = torch.zeros(n, kept, dtype=torch.int64)  # control step of each frame
-        self._late = torch.full((n,), latency[0])
-        self._step = torch.zeros(n, dtype=torch.int64)
+        self._frames = torch.zeros(n, kept, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH, device=device)  # newest last
+        self._taken = torch.zeros(n, kept, dtype=torch.int64, device=device)  # control step of each frame
+        self._late = torch.full((n,), latency[0], device=device)
+        self._step = torch.zeros(n, dtype=torch.int64, device=device)
 
     def begin(self, mask: Tensor) -> None:
         """Start episodes of the rows of a bool mask ``[N]``, which the simulator has just put somewhere."""
-        n = len(mask)
-        late = torch.randint(self.latency[0], self.latency[1] + 1, (n,), generator=self.generator)
-        pitch = self.pitch * (2.0 * torch.rand(n, generator=self.generator) - 1.0)
+        n, device = len(mask), mask.device
+        late = torch.randint(self.latency[0], self.latency[1] + 1, (n,), generator=self.generator, device=device)
+        pitch = self.pitch * (2.0 * torch.rand(n, generator=self.generator, device=device) - 1.0)
         self._late = torch.where(mask, late, self._late)
         self._step = self._step.masked_fill(mask, 0)
         self.camera.set_pitch(mask, pitch)
@@ -102,7 +102,7 @@ class DepthObservation:
         """What the robots see, normalised, ``[N, 58, 87]``."""
         old_enough = self._taken <= (self._step - self._late)[:, None]
         index = old_enough.sum(-1).clamp(min=1) - 1  # frames are ordered by age
-        return self._frames[torch.arange(len(index)), index]
+        return self._frames[torch.arange(len(index), device=index.device), index]
 
     def _take(self, mask: Tensor) -> Tensor:
         """Normalised frames ``[M, 58, 87]`` of the rows of a bool mask."""
@@ -110,8 +110,8 @@ class DepthObservation:
         if self.offset_noise or self.pixel_noise:
             # Drawn for every robot, whoever's frame is due, so that one robot's noise does not depend on the others.
             n = len(mask)
-            offset, scale = torch.rand(2, n, 1, 1, generator=self.generator)
-            pixel = torch.rand(n, *depth.shape[1:], generator=self.generator)
+            offset, scale = torch.rand(2, n, 1, 1, generator=self.generator, device=mask.device)
+            pixel = torch.rand(n, *depth.shape[1:], generator=self.generator, device=mask.device)
             noise = self.offset_noise * (2.0 * offset - 1.0) + self.pixel_noise * scale * (2.0 * pixel - 1.0)
             depth = depth + noise[mask]
         return camera.normalize_depth(depth)
@@ -134,4 +134,4 @@ class DepthObservation:
             )
         for name in ("frames", "taken", "late", "step"):
             setattr(self, f"_{name}", state[name].clone())
-        self.camera.set_pitch(torch.ones(len(self._step), dtype=torch.bool), state["pitch"])
+        self.camera.set_pitch(torch.ones_like(self._step, dtype=torch.bool), state["pitch"])

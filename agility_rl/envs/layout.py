@@ -49,24 +49,25 @@ class CourseLayout:
 
     def __init__(self, course: Course, num_robots: int, generator: torch.Generator) -> None:
         self.course, self.generator = course, generator
+        self.device = device = generator.device
         self.kinds = tuple(slot.kind for slot in course.slots)
         n = num_robots
-        self.pieces = tuple(
-            Piece(f"{index}_{kind.name}_{piece.name}", piece.shapes, piece.hinge)
-            for index, kind in enumerate(self.kinds)
-            for piece in kind.pieces
-        ) + _walls(course)
+        self.pieces = scenery(course)
         owners = [(index, number) for index, kind in enumerate(self.kinds) for number in range(len(kind.pieces))]
-        self._owner = torch.tensor([index for index, _ in owners])
-        self._lifted = torch.tensor([self.kinds[index].lifted == number for index, number in owners])
-        self._hinged = [self.kinds[index].pieces[number].hinge is not None for index, number in owners]
+        self._owner = torch.tensor([index for index, _ in owners], device=device)
+        self._lifted = torch.tensor([self.kinds[index].lifted == number for index, number in owners], device=device)
+        hinged = [index for index, number in owners if self.kinds[index].pieces[number].hinge is not None]
+        self._hinged = torch.tensor(hinged, dtype=torch.int64, device=device)  # obstacle of each hinge
+        self._middles = torch.tensor(_wall_middles(course), device=device)
+        self._upright = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device)
 
-        self._place = torch.tensor([(*slot.position, slot.yaw) for slot in course.slots])
-        self._jitter = torch.tensor([tuple(slot.jitter) for slot in course.slots])
-        self._heights = torch.tensor([slot.heights for slot in course.slots])
+        self._place = torch.tensor([(*slot.position, slot.yaw) for slot in course.slots], device=device)
+        self._jitter = torch.tensor([tuple(slot.jitter) for slot in course.slots], device=device)
+        self._heights = torch.tensor([slot.heights for slot in course.slots], device=device)
         longest = max(len(route) for route in course.routes)
-        self._routes = torch.tensor([(*route, *(route[-1],) * (longest - len(route))) for route in course.routes])
-        self._lengths = torch.tensor([len(route) for route in course.routes])
+        routes = [(*route, *(route[-1],) * (longest - len(route))) for route in course.routes]
+        self._routes = torch.tensor(routes, device=device)
+        self._lengths = torch.tensor([len(route) for route in course.routes], device=device)
         self._wall_range = course.wall_height or (0.0, 0.0)
 
         self.difficulty = 1.0
@@ -75,20 +76,22 @@ class CourseLayout:
         self.lift = self._heights[:, 0].repeat(n, 1)
         self.route = self._routes[0].repeat(n, 1)
         self.length = self._lengths[0].repeat(n)
-        self.wall_height = torch.full((n,), self._wall_range[0])
+        self.wall_height = torch.full((n,), self._wall_range[0], device=device)
 
     def draw(self, mask: Tensor) -> None:
         """Draw the rows of a bool mask ``[N]`` anew."""
         n, k = self.yaw.shape
 
         def uniform(*shape: int) -> Tensor:
-            return torch.rand(shape, generator=self.generator)
+            return torch.rand(shape, generator=self.generator, device=self.device)
 
-        slot = uniform(n, k).argsort(-1) if self.course.shuffle else torch.arange(k).repeat(n, 1)  # of each obstacle
+        # of each obstacle
+        slot = uniform(n, k) if self.course.shuffle else torch.arange(k, device=self.device).repeat(n, 1)
+        slot = slot.argsort(-1)
         place = self._place[slot] + self._jitter[slot] * (2.0 * uniform(n, k, 3) - 1.0)
         low, high = self._heights.unbind(-1)
         lift = low + (high - low) * self.difficulty * uniform(n, k)
-        choice = torch.randint(len(self._routes), (n,), generator=self.generator)
+        choice = torch.randint(len(self._routes), (n,), generator=self.generator, device=self.device)
         route = slot.argsort(-1).gather(1, self._routes[choice])  # slots, then the obstacles that stand there
         walls = self._wall_range[0] + (self._wall_range[1] - self._wall_range[0]) * uniform(n)
         # New tensors, because observations of earlier steps may still refer to the old ones.
@@ -100,8 +103,7 @@ class CourseLayout:
     @property
     def owners(self) -> Tensor:
         """Obstacle that each of :attr:`pieces` belongs to, int64 ``[P]``; -1 for walls."""
-        walls = torch.full((len(self.pieces) - len(self._owner),), -1)
-        return torch.cat((self._owner, walls))
+        return torch.nn.functional.pad(self._owner, (0, len(self.pieces) - len(self._owner)), value=-1)
 
     def poses(self) -> tuple[Tensor, Tensor, Tensor]:
         """Positions ``[N, P, 3]``, quaternions ``[N, P, 4]`` and hinge angles ``[N, H]`` of :attr:`pieces`."""
@@ -112,21 +114,18 @@ class CourseLayout:
         zero = torch.zeros_like(half)
         quaternion = torch.stack((half.cos(), zero, zero, half.sin()), -1)
         if walls := len(self.pieces) - len(self._owner):
-            middle = torch.tensor(_wall_middles(self.course)).repeat(n, 1, 1)
+            middle = self._middles.repeat(n, 1, 1)
             sunk = (self.wall_height - TALLEST_WALL / 2)[:, None, None].expand(n, walls, 1)
             position = torch.cat((position, torch.cat((middle, sunk), -1)), 1)
-            upright = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, walls, 1)
+            upright = self._upright.repeat(n, walls, 1)
             quaternion = torch.cat((quaternion, upright), 1)
-        return position, quaternion, torch.full((n, sum(self._hinged)), SEESAW_TILT)
+        return position, quaternion, torch.full((n, len(self._hinged)), SEESAW_TILT, device=self.device)
 
     def parameter(self, hinge_angle: Tensor) -> Tensor:
         """What the profiles of the obstacles take, ``[N, K]``: the height of the lifted piece, or a hinge's tangent."""
-        hinges = [index for index, hinged in zip(self._owner.tolist(), self._hinged, strict=True) if hinged]
-        if not hinges:
+        if not len(self._hinged):
             return self.lift
-        parameter = self.lift.clone()
-        parameter[:, hinges] = hinge_angle.tan()
-        return parameter
+        return self.lift.index_copy(1, self._hinged, hinge_angle.tan())
 
     def local(self, points: Tensor) -> Tensor:
         """World points ``[N, P, 2]`` in the frame of every obstacle, ``[N, K, P, 2]``."""
@@ -136,7 +135,7 @@ class CourseLayout:
 
     def local_to(self, obstacle: Tensor, point: Tensor) -> Tensor:
         """World points ``[N, 2]`` in the frame of one obstacle each (int64 ``[N]``), ``[N, 2]``."""
-        row = torch.arange(len(obstacle))
+        row = torch.arange(len(obstacle), device=obstacle.device)
         yaw = self.yaw[row, obstacle]
         cos, sin = yaw.cos(), yaw.sin()
         x, y = (point - self.position[row, obstacle]).unbind(-1)
@@ -144,7 +143,7 @@ class CourseLayout:
 
     def world(self, obstacle: Tensor, point: Tensor) -> Tensor:
         """Local points ``[N, 2]`` of one obstacle each (int64 ``[N]``) in the world, ``[N, 2]``."""
-        row = torch.arange(len(obstacle))
+        row = torch.arange(len(obstacle), device=obstacle.device)
         yaw = self.yaw[row, obstacle]
         cos, sin = yaw.cos(), yaw.sin()
         x, y = point.unbind(-1)
@@ -168,6 +167,21 @@ class CourseLayout:
         for name in _BUFFERS:
             setattr(self, name, state[name].clone())
         self.difficulty = state["difficulty"]
+
+
+def scenery(course: Course) -> tuple[Piece, ...]:
+    """What a simulator must hold for a course: the pieces of its obstacles, slot by slot, then its walls.
+
+    Example:
+        >>> from agility_rl.envs.course_presets import COURSES
+        >>> [piece.name for piece in scenery(COURSES["bar_jump"])][:3]
+        ['0_bar_jump_wings', '0_bar_jump_bar', 'wall_0']
+    """
+    return tuple(
+        Piece(f"{index}_{slot.kind.name}_{piece.name}", piece.shapes, piece.hinge)
+        for index, slot in enumerate(course.slots)
+        for piece in slot.kind.pieces
+    ) + _walls(course)
 
 
 def _wall_middles(course: Course) -> list[tuple[float, float]]:

@@ -90,9 +90,10 @@ class LocomotionEnv(EnvBase):
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
         seed: int = 0,
     ) -> None:
-        super().__init__(device="cpu", batch_size=torch.Size([num_robots]))
+        simulator = simulator or make_simulator(num_simulations=num_robots, **(simulator_options or {}))
+        super().__init__(device=simulator.device, batch_size=torch.Size([num_robots]))
         self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
-        self.simulator = simulator or make_simulator(num_simulations=num_robots, **(simulator_options or {}))
+        self.simulator, device = simulator, simulator.device
         if self.simulator.num_simulations != num_robots:
             raise ValueError(f"the simulator holds {self.simulator.num_simulations} robots, expected {num_robots}")
         self.dt = self.simulator.control_dt
@@ -100,17 +101,19 @@ class LocomotionEnv(EnvBase):
         self.terminations = tuple(terminations)
         self.randomization = randomization
         self.max_steps = round(episode_length / self.dt)
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = torch.Generator(device).manual_seed(seed)
         period = None if resample_period is None else round(resample_period / self.dt)
         self.commands = CommandSampler(num_robots, self.generator, period)
         self.observations = ObservationGroups(num_robots, self.generator, observation_noise, motion_offsets)
-        self.reference = ReferenceStates.standing() if reference is None else ReferenceStates(reference)
+        self.reference = (
+            ReferenceStates.standing(device) if reference is None else ReferenceStates(reference.to(device))
+        )
         self.reference.check_past(motion_offsets[-1])
         n = num_robots
         interval = None if push_interval is None else round(push_interval / self.dt)
         self.pushes = Pushes(n, self.generator, interval, push_velocity)
         self.robots = Robots(self.simulator, self.generator)
-        self._step_count = torch.zeros(n, dtype=torch.int64)
+        self._step_count = torch.zeros(n, dtype=torch.int64, device=device)
         self._make_specs(n)
 
     def _make_specs(self, n: int) -> None:
@@ -151,12 +154,15 @@ class LocomotionEnv(EnvBase):
             command: ``[N, 5]`` in the order and units of :data:`agility_rl.behaviours.COMMANDS`.
             shift: ``[N, 1]`` in [-1, 1], zero if not given.
         """
-        shift = torch.zeros(self.num_robots, 1) if shift is None else shift
-        self.commands.assign(torch.ones(self.num_robots, dtype=torch.bool), skill, command, shift)
+        shift = torch.zeros(self.num_robots, 1, device=self.device) if shift is None else shift
+        self.commands.assign(self._everyone(), skill, command, shift)
 
     def set_skill_probabilities(self, probabilities: Tensor) -> None:
         """Draw future skills from ``[5]`` probabilities (the skill prior)."""
-        self.commands.probabilities = probabilities.detach().clone()
+        self.commands.probabilities = probabilities.detach().to(self.device, copy=True)
+
+    def _everyone(self) -> Tensor:
+        return torch.ones(self.num_robots, dtype=torch.bool, device=self.device)
 
     # -- TorchRL -----------------------------------------------------------------------------------------------------
     def _set_seed(self, seed: int | None) -> None:
@@ -164,7 +170,7 @@ class LocomotionEnv(EnvBase):
             self.generator.manual_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = torch.ones(self.num_robots, dtype=torch.bool)
+        mask = self._everyone()
         if tensordict is not None and (chosen := tensordict.get("_reset", None)) is not None:
             mask = chosen.reshape(self.num_robots)
         if self.commands.period is not None:
@@ -178,10 +184,10 @@ class LocomotionEnv(EnvBase):
         self.observations.reset(mask, state, past)
 
         observation = self.observations.build(state, self.commands, self.robots.privileged)
-        nothing = {name: torch.zeros(self.num_robots, 1) for name in self.rewards}
+        nothing = {name: torch.zeros(self.num_robots, 1, device=self.device) for name in self.rewards}
         observation[keys.REWARD_TERMS] = TensorDict(nothing, self.batch_size)
         for name in ("done", "terminated", "truncated"):
-            observation[name] = torch.zeros(self.num_robots, 1, dtype=torch.bool)
+            observation[name] = torch.zeros(self.num_robots, 1, dtype=torch.bool, device=self.device)
         return observation
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -211,11 +217,12 @@ class LocomotionEnv(EnvBase):
 
     # -- physics -----------------------------------------------------------------------------------------------------
     def _place(self, mask: Tensor) -> Tensor | None:
-        n = self.num_robots
+        n, device = self.num_robots, self.device
         start = self.reference.sample(self.commands.skill, self.generator)
-        yaw = 2.0 * torch.pi * torch.rand(n, generator=self.generator)
-        turn = rotations.from_euler(torch.zeros(n), torch.zeros(n), yaw)
-        place = self.simulator.ground_extent * (2.0 * torch.rand(n, 2, generator=self.generator) - 1.0)
+        yaw = 2.0 * torch.pi * torch.rand(n, generator=self.generator, device=device)
+        turn = rotations.from_euler(torch.zeros_like(yaw), torch.zeros_like(yaw), yaw)
+        place = torch.rand(n, 2, generator=self.generator, device=device)
+        place = self.simulator.ground_extent * (2.0 * place - 1.0)
         height = self.simulator.ground_height(place)[:, None] + start["root_height"] + CLEARANCE
         self.simulator.reset(
             mask,

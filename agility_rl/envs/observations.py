@@ -36,13 +36,13 @@ class ObservationGroups:
         noise: float = 0.0,
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
     ) -> None:
-        self.generator = generator
-        self.noise = noise * features.noise_scale(features.PROPRIOCEPTION_LAYOUT) if noise else None
-        self.history = torch.zeros(num_robots, features.HISTORY, features.NUM_PROPRIOCEPTION)
+        self.generator, device = generator, generator.device
+        self.noise = noise * features.noise_scale(features.PROPRIOCEPTION_LAYOUT, device) if noise else None
+        self.history = torch.zeros(num_robots, features.HISTORY, features.NUM_PROPRIOCEPTION, device=device)
         features.check_motion_offsets(motion_offsets)
-        self.motion_offsets = torch.tensor(motion_offsets)
-        self.motion = torch.zeros(num_robots, motion_offsets[-1] + 1, features.NUM_MOTION)
-        self.touched = torch.zeros(num_robots, 4, dtype=torch.bool)
+        self.motion_offsets = torch.tensor(motion_offsets, device=device)
+        self.motion = torch.zeros(num_robots, motion_offsets[-1] + 1, features.NUM_MOTION, device=device)
+        self.touched = torch.zeros(num_robots, 4, dtype=torch.bool, device=device)
 
     def reset(self, mask: Tensor, state: LocomotionState, past: Tensor | None = None) -> None:
         """Fill the memories of the rows of a bool mask ``[N]`` with copies of the present.
@@ -97,7 +97,8 @@ class ObservationGroups:
             touched,
         )
         if self.noise is not None:
-            measured = measured + self.noise * (2.0 * torch.rand(measured.shape, generator=self.generator) - 1.0)
+            uniform = torch.rand(measured.shape, generator=self.generator, device=measured.device)
+            measured = measured + self.noise * (2.0 * uniform - 1.0)
         return measured.clamp(-features.OBSERVATION_LIMIT, features.OBSERVATION_LIMIT)
 
     def state_dict(self) -> dict[str, Any]:

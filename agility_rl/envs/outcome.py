@@ -29,6 +29,7 @@ class DecisionOutcome:
         num_robots: N.
         terms: names of the reward terms.
         causes: names of the failures.
+        device: of the sums.
 
     Attributes:
         running: bool ``[N]``, the episode goes on.
@@ -43,13 +44,15 @@ class DecisionOutcome:
         ([False, True], [True, False])
     """
 
-    def __init__(self, num_robots: int, terms: Iterable[str], causes: Iterable[str]) -> None:
+    def __init__(
+        self, num_robots: int, terms: Iterable[str], causes: Iterable[str], device: torch.device | str = "cpu"
+    ) -> None:
         def none(*shape: int) -> Tensor:
-            return torch.zeros(num_robots, *shape, dtype=torch.bool)
+            return torch.zeros(num_robots, *shape, dtype=torch.bool, device=device)
 
         self.running = ~none()
-        self.reward = torch.zeros(num_robots)
-        self.terms = {name: torch.zeros(num_robots) for name in terms}
+        self.reward = torch.zeros(num_robots, device=device)
+        self.terms = {name: torch.zeros(num_robots, device=device) for name in terms}
         self.causes = {name: none() for name in causes}
         self.finished, self.terminated, self.truncated = none(), none(), none()
         self.passed, self.bypassed, self.failed = (none(len(OBSTACLES)) for _ in range(3))

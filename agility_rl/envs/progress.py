@@ -57,17 +57,19 @@ class CourseProgress:
     """
 
     def __init__(self, layout: CourseLayout, radius: float = GOAL_RADIUS) -> None:
-        self.layout, self.radius = layout, radius
+        self.layout, self.radius, device = layout, radius, layout.device
         goals = [slot.goals for slot in layout.course.slots]
         longest = max(map(len, goals))
-        self._points = torch.tensor([(*points, *(points[-1],) * (longest - len(points))) for points in goals])
-        self._count = torch.tensor([len(points) for points in goals])
-        self._passage = torch.tensor([kind.passage for kind in layout.kinds])
+        filled = [(*points, *(points[-1],) * (longest - len(points))) for points in goals]
+        self._points = torch.tensor(filled, device=device)
+        self._count = torch.tensor([len(points) for points in goals], device=device)
+        self._passage = torch.tensor([kind.passage for kind in layout.kinds], device=device)
+        self._beyond = torch.tensor([0.0, _BEYOND], device=device)
         n = len(layout.length)
-        self.leg, self.point, self.inside = (torch.zeros(n, dtype=torch.int64) for _ in range(3))
+        self.leg, self.point, self.inside = (torch.zeros(n, dtype=torch.int64, device=device) for _ in range(3))
         self.end = layout.length.clone()
-        self.local = torch.zeros(n, 2)
-        self.around, self.detour, self.finished = (torch.zeros(n, dtype=torch.bool) for _ in range(3))
+        self.local = torch.zeros(n, 2, device=device)
+        self.around, self.detour, self.finished = (torch.zeros(n, dtype=torch.bool, device=device) for _ in range(3))
 
     def begin(self, mask: Tensor, leg: Tensor, end: Tensor) -> None:
         """Let the rows of a bool mask ``[N]`` start before obstacle ``leg`` of their route and finish before ``end``.
@@ -108,7 +110,7 @@ class CourseProgress:
         leg, point = self._after()
         coming = self._obstacle(leg)
         following = self.layout.world(coming, self._points[coming, point])
-        beyond = current + torch.tensor([0.0, _BEYOND])
+        beyond = current + self._beyond
         return current, torch.where((leg >= self.end)[:, None], beyond, following)
 
     def _after(self) -> tuple[Tensor, Tensor]:

@@ -45,7 +45,7 @@ def uniform(shape: tuple[int, ...], interval: tuple[float, float], generator: to
     low, high = interval
     if low > high:
         raise ValueError(f"an interval must be (low, high) with low <= high, got ({low}, {high})")
-    return low + (high - low) * torch.rand(shape, generator=generator)
+    return low + (high - low) * torch.rand(shape, generator=generator, device=generator.device)
 
 
 def sample_parameters(

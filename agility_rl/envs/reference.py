@@ -8,6 +8,7 @@ from torch import Tensor
 
 from agility_rl import behaviours
 from agility_rl.go2 import constants, features
+from agility_rl.tensors import constant
 
 STATE_ENTRIES = (
     "root_height",
@@ -37,15 +38,16 @@ def standing_states(skill: Tensor, span: int = 0) -> TensorDict:
         >>> standing_states(torch.tensor([0, 4]), span=24)["past_motion"].shape
         torch.Size([2, 24, 49])
     """
-    n = len(skill)
+    n, device = len(skill), skill.device
+    upright = torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device)
     states = TensorDict(
         {
-            "root_height": torch.full((n, 1), constants.STANDING_HEIGHT),
-            "root_quaternion": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(n, 1),
-            "root_linear_velocity": torch.zeros(n, 3),
-            "root_angular_velocity": torch.zeros(n, 3),
-            "joint_position": torch.tensor(constants.DEFAULT_POSE).repeat(n, 1),
-            "joint_velocity": torch.zeros(n, constants.NUM_JOINTS),
+            "root_height": torch.full((n, 1), constants.STANDING_HEIGHT, device=device),
+            "root_quaternion": upright.repeat(n, 1),
+            "root_linear_velocity": torch.zeros(n, 3, device=device),
+            "root_angular_velocity": torch.zeros(n, 3, device=device),
+            "joint_position": constant(constants.DEFAULT_POSE, device).repeat(n, 1),
+            "joint_velocity": torch.zeros(n, constants.NUM_JOINTS, device=device),
         },
         [n],
     )
@@ -99,11 +101,11 @@ class ReferenceStates:
             )
 
     @classmethod
-    def standing(cls) -> ReferenceStates:
+    def standing(cls, device: torch.device | str = "cpu") -> ReferenceStates:
         """One state for all behaviours: standing in the default pose."""
-        return cls(standing_states(torch.arange(behaviours.NUM_BEHAVIOURS)))
+        return cls(standing_states(torch.arange(behaviours.NUM_BEHAVIOURS, device=device)))
 
     def sample(self, skill: Tensor, generator: torch.Generator) -> TensorDictBase:
         """A random state of each given skill, ``[N]``."""
-        fraction = torch.rand(skill.shape, generator=generator)
+        fraction = torch.rand(skill.shape, generator=generator, device=skill.device)
         return self.states[self.first[skill] + (fraction * self.count[skill]).long()]

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants
+from agility_rl.tensors import constant
 
 RewardFunction = Callable[[LocomotionState], Tensor]
 
@@ -108,19 +109,20 @@ def joint_acceleration(state: LocomotionState) -> Tensor:
 
 def joint_position_limit(state: LocomotionState) -> Tensor:
     """Sum of excursions beyond 0.9 of the joint range [rad] (S4; factor: released code)."""
-    lower, upper = constants.soft_joint_limits()
+    device = state.joint_position.device
+    lower, upper = (constant(limits, device) for limits in constants.soft_joint_limits())
     return ((lower - state.joint_position).clamp(min=0) + (state.joint_position - upper).clamp(min=0)).sum(-1)
 
 
 def joint_velocity_limit(state: LocomotionState) -> Tensor:
     """Sum of joint speeds beyond the limit, each at most 1 [rad/s] (S4)."""
-    limit = torch.tensor(constants.VELOCITY_LIMIT)
+    limit = constant(constants.VELOCITY_LIMIT, state.joint_velocity.device)
     return (state.joint_velocity.abs() - limit).clamp(0.0, 1.0).sum(-1)
 
 
 def torque_limit(state: LocomotionState) -> Tensor:
     """Sum of PD torques beyond the limit [N m] (S4)."""
-    limit = torch.tensor(constants.TORQUE_LIMIT)
+    limit = constant(constants.TORQUE_LIMIT, state.torque.device)
     return (state.torque.abs() - limit).clamp(min=0).sum(-1)
 
 
@@ -136,13 +138,16 @@ def action_smoothness(state: LocomotionState) -> Tensor:
 
 def hip_deviation(state: LocomotionState) -> Tensor:
     """Sum of squared hip angles from the default pose [rad^2] (released code)."""
-    default = torch.tensor(constants.DEFAULT_POSE)
-    return (state.joint_position - default)[:, ::3].square().sum(-1)
+    return _from_default(state)[:, ::3].square().sum(-1)
 
 
 def pose_deviation(state: LocomotionState) -> Tensor:
     """Sum of squared joint angles from the default pose [rad^2] (released code)."""
-    return (state.joint_position - torch.tensor(constants.DEFAULT_POSE)).square().sum(-1)
+    return _from_default(state).square().sum(-1)
+
+
+def _from_default(state: LocomotionState) -> Tensor:
+    return state.joint_position - constant(constants.DEFAULT_POSE, state.joint_position.device)
 
 
 LOCOMOTION_REWARDS: Mapping[str, RewardTerm] = {

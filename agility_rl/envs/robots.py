@@ -14,6 +14,7 @@ from agility_rl.envs.randomization import NOMINAL, Randomization, sample_paramet
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator
+from agility_rl.tensors import constant
 
 STRIDE = 0.5
 """Time constant over which a robot's velocities are averaged [s]: a dog does not walk at a constant speed."""
@@ -56,11 +57,14 @@ class Robots:
         self.simulator, self.generator = simulator, generator
         self.ground = simulator.ground_height if ground is None else ground
         self.dt = simulator.control_dt
-        self._default_pose = torch.tensor(constants.DEFAULT_POSE)
-        self._action_scale = torch.tensor(constants.ACTION_SCALE)
-        self.action, self.torque, self.joint_velocity = (torch.zeros(n, constants.NUM_JOINTS) for _ in range(3))
-        self.mean_velocity, self.mean_yaw_rate = torch.zeros(n, 3), torch.zeros(n)
-        self.heights = torch.zeros(n, round(features.PEAK_WINDOW / self.dt))
+        device = simulator.device
+        self._default_pose = constant(constants.DEFAULT_POSE, device)
+        self._action_scale = constant(constants.ACTION_SCALE, device)
+        self.action, self.torque, self.joint_velocity = (
+            torch.zeros(n, constants.NUM_JOINTS, device=device) for _ in range(3)
+        )
+        self.mean_velocity, self.mean_yaw_rate = torch.zeros(n, 3, device=device), torch.zeros(n, device=device)
+        self.heights = torch.zeros(n, round(features.PEAK_WINDOW / self.dt), device=device)
         fields, self.privileged = sample_parameters(n, NOMINAL, generator)
         self.stiffness, self.damping = fields["stiffness"], fields["damping"]
 
@@ -168,12 +172,12 @@ class Pushes:
 
     def __init__(self, num_robots: int, generator: torch.Generator, interval: int | None, velocity: float) -> None:
         self.generator, self.interval, self.velocity = generator, interval, velocity
-        self.phase = torch.zeros(num_robots, dtype=torch.int64)
+        self.phase = torch.zeros(num_robots, dtype=torch.int64, device=generator.device)
 
     def begin(self, mask: Tensor) -> None:
         """Draw the moments of the rows of a bool mask ``[N]``."""
         if self.interval is not None:
-            phase = torch.randint(self.interval, (len(mask),), generator=self.generator)
+            phase = torch.randint(self.interval, (len(mask),), generator=self.generator, device=mask.device)
             self.phase = torch.where(mask, phase, self.phase)
 
     def apply(self, simulator: Simulator, step_count: Tensor) -> None:
@@ -182,5 +186,5 @@ class Pushes:
             return
         mask = (step_count + self.phase) % self.interval == self.interval - 1
         if bool(mask.any()):
-            velocity = self.velocity * (2.0 * torch.rand(len(mask), 2, generator=self.generator) - 1.0)
-            simulator.push(mask, velocity)
+            uniform = torch.rand(len(mask), 2, generator=self.generator, device=mask.device)
+            simulator.push(mask, self.velocity * (2.0 * uniform - 1.0))

@@ -45,25 +45,27 @@ class HeightScan:
     """
 
     def __init__(self, layout: CourseLayout, *, neighbours: bool = True) -> None:
-        self.layout = layout
+        self.layout, device = layout, layout.device
         kinds = layout.kinds
         axes = []
         for axis in (0, 1):
             cells = int(max(kind.half_extents[axis] for kind in kinds) / CELL) + 2  # the rim is ground
-            axes.append(torch.arange(-cells, cells + 1) * CELL)
+            axes.append(torch.arange(-cells, cells + 1, device=device) * CELL)
         grid = torch.meshgrid(*axes, indexing="ij")
         profiles = [kind.profile(*grid) for kind in kinds]
         # One table [K, X, Y] for each part of a profile; its rim stands for everything outside.
         self._exact = tuple(torch.stack(part) for part in zip(*profiles, strict=True))
         usual = [math.tan(SEESAW_TILT) if kind.difficulty is None else kind.difficulty.high for kind in kinds]
-        self._tables = _lowest(self._exact, torch.tensor(usual)[:, None, None]) if neighbours else self._exact
-        self._supports = torch.tensor([kind.supports for kind in kinds])
-        self._circle = torch.tensor([kind.half_extents for kind in kinds]).norm(dim=-1)
+        usual_parameter = torch.tensor(usual, device=device)[:, None, None]
+        self._tables = _lowest(self._exact, usual_parameter) if neighbours else self._exact
+        self._supports = torch.tensor([kind.supports for kind in kinds], device=device)
+        self._circle = torch.tensor([kind.half_extents for kind in kinds], device=device).norm(dim=-1)
         zones = [(index, *zone) for index, kind in enumerate(kinds) for zone in kind.edges]
-        self._zone_owner = torch.tensor([index for index, *_ in zones], dtype=torch.int64)
-        self._zones = torch.tensor([zone for _, *zone in zones]).reshape(-1, 4)
-        points = torch.cartesian_prod(torch.tensor(GRID_Y), torch.tensor(GRID_X)).flip(-1)
-        self._grid = torch.cat((points, torch.ones(len(points), 1)), -1).T.contiguous()  # [3, 132]
+        self._zone_owner = torch.tensor([index for index, *_ in zones], dtype=torch.int64, device=device)
+        self._zones = torch.tensor([zone for _, *zone in zones], device=device).reshape(-1, 4)
+        points = [(x, y, 1.0) for y in GRID_Y for x in GRID_X]
+        self._grid = torch.tensor(points, device=device).T.contiguous()  # [3, 132]
+        self._size = torch.tensor(layout.course.size, device=device)
         self._ahead = (GRID_X[0] + GRID_X[-1]) / 2  # middle of the grid; a circle about it holds all points
         self._radius = math.hypot(self._ahead, GRID_Y[-1])
 
@@ -89,7 +91,7 @@ class HeightScan:
         local = layout.local(position[:, None])[row, obstacle, 0]
         points = (_frame(turn, local) / CELL).flatten(0, 1) @ self._grid  # cells, [2M, 132]
         value = self._look_up(self._tables, obstacle, points.unflatten(0, (-1, 2)), parameter[row, obstacle])
-        heights = torch.zeros(len(position), NUM_SCANDOTS)
+        heights = torch.zeros(len(position), NUM_SCANDOTS, device=position.device)
         heights.scatter_reduce_(0, row[:, None].expand_as(value), value, "amax")
         if layout.course.wall_height is not None:
             heights = self._with_walls(heights, position, yaw)
@@ -105,7 +107,7 @@ class HeightScan:
         return torch.addcmul(base, gain, parameter[:, None])
 
     def _with_walls(self, heights: Tensor, position: Tensor, yaw: Tensor) -> Tensor:
-        size = torch.tensor(self.layout.course.size)
+        size = self._size
         rim = self._ahead + self._radius
         close = ((position < rim) | (position > size - rim)).any(-1).nonzero()[:, 0]
         points = _frame(yaw[close], position[close]) @ self._grid  # [M, 2, 132]
@@ -117,7 +119,7 @@ class HeightScan:
         """Height [m] of what a robot can stand on at world points ``[N, P, 2]``, as ``[N, P]``; gates carry nobody."""
         n, p = points.shape[:2]
         cells = self.layout.local(points).div_(CELL).flatten(0, 1).transpose(1, 2)  # [N K, 2, P]
-        obstacle = torch.arange(len(self.layout.kinds)).repeat(n)
+        obstacle = torch.arange(len(self.layout.kinds), device=points.device).repeat(n)
         height = self._look_up(self._exact, obstacle, cells, parameter.flatten()).view(n, -1, p)
         return torch.where(self._supports[:, None], height, 0.0).amax(1).clamp_(min=0.0)
 

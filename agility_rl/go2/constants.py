@@ -8,8 +8,6 @@ published with "Learning Diverse Natural Behaviors for Enhancing the Agility of 
 
 from __future__ import annotations
 
-import torch
-
 LEGS = ("FL", "FR", "RL", "RR")
 """Front left, front right, rear left, rear right: the order of legs, joints and feet."""
 
@@ -130,8 +128,9 @@ TRUNK_MASS = 6.921
 """Mass of the trunk with the head [kg]. [M]"""
 
 
-def soft_joint_limits() -> tuple[torch.Tensor, torch.Tensor]:
-    """Lower and upper joint positions [rad], each ``[12]``, at :data:`SOFT_LIMIT_FACTOR` of the range."""
-    lower, upper = torch.tensor(JOINT_LOWER), torch.tensor(JOINT_UPPER)
-    middle, half = (upper + lower) / 2, (upper - lower) / 2 * SOFT_LIMIT_FACTOR
-    return middle - half, middle + half
+def soft_joint_limits() -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Lower and upper joint positions [rad], of 12 joints each, at :data:`SOFT_LIMIT_FACTOR` of the range."""
+    shrink = (1.0 - SOFT_LIMIT_FACTOR) / 2.0
+    ranges = tuple(zip(JOINT_LOWER, JOINT_UPPER, strict=True))
+    lower = tuple(low + shrink * (high - low) for low, high in ranges)
+    return lower, tuple(high - shrink * (high - low) for low, high in ranges)

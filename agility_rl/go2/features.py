@@ -17,6 +17,7 @@ from torch import Tensor
 
 from agility_rl import rotations
 from agility_rl.go2 import constants, kinematics
+from agility_rl.tensors import constant
 
 ANGULAR_VELOCITY_SCALE = 0.25
 LINEAR_VELOCITY_SCALE = 0.5
@@ -125,9 +126,9 @@ def layout_slice(layout: tuple[Entry, ...], name: str) -> slice:
     raise KeyError(f"no entry {name!r}; the layout has {', '.join(entry.name for entry in layout)}")
 
 
-def noise_scale(layout: tuple[Entry, ...]) -> Tensor:
+def noise_scale(layout: tuple[Entry, ...], device: torch.device | str = "cpu") -> Tensor:
     """Half-width of the uniform observation noise of every number, scaled like the number itself."""
-    return torch.cat([torch.full((entry.size,), entry.noise * entry.scale) for entry in layout])
+    return torch.tensor([entry.noise * entry.scale for entry in layout for _ in range(entry.size)], device=device)
 
 
 def proprioception(
@@ -151,7 +152,7 @@ def proprioception(
     Returns:
         ``[*B, 45]`` laid out as :data:`PROPRIOCEPTION_LAYOUT`.
     """
-    default = torch.as_tensor(constants.DEFAULT_POSE, dtype=joint_position.dtype)
+    default = constant(constants.DEFAULT_POSE, joint_position.device, joint_position.dtype)
     return torch.cat(
         (
             roll_pitch,
@@ -227,7 +228,7 @@ def motion_frame(
     if feet is None:
         feet = feet_in_heading_frame(roll, pitch, joint_position)
     contact = (root_height + feet[..., 2] - constants.FOOT_RADIUS) < CONTACT_HEIGHT
-    default = torch.as_tensor(constants.DEFAULT_POSE, dtype=joint_position.dtype)
+    default = constant(constants.DEFAULT_POSE, joint_position.device, joint_position.dtype)
     return torch.cat(
         (
             torch.stack((roll, pitch), -1),

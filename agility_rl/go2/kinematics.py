@@ -5,21 +5,28 @@ A leg is a hip joint about x, then a sideways offset, then thigh and calf joints
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from agility_rl.go2 import constants
+from agility_rl.tensors import constant
 
 _ALONG = (1.0, 1.0, -1.0, -1.0)
 _SIDE = (1.0, -1.0, 1.0, -1.0)
+_HIPS = tuple((constants.HIP_OFFSET_X * x, constants.HIP_OFFSET_Y * y, 0.0) for x, y in zip(_ALONG, _SIDE, strict=True))
+_SIDEWAYS = tuple(constants.ABDUCTION * side for side in _SIDE)
 # The foot's centre is off the calf's axis: together they act as one straight shank, slightly turned and longer.
 _SHANK = (constants.CALF**2 + constants.FOOT_OFFSET_X**2) ** 0.5
 
 
 def hip_positions(like: Tensor) -> Tensor:
-    """Positions of the hip joints in the base frame [m], ``[4, 3]``, with the dtype and device of ``like``."""
-    rows = [(constants.HIP_OFFSET_X * x, constants.HIP_OFFSET_Y * y, 0.0) for x, y in zip(_ALONG, _SIDE, strict=True)]
-    return torch.tensor(rows, dtype=like.dtype, device=like.device)
+    """Positions of the hip joints in the base frame [m], ``[4, 3]``, with the dtype and device of ``like``.
+
+    They are shared (:func:`agility_rl.tensors.constant`): never change them in place.
+    """
+    return constant(_HIPS, like.device, like.dtype)
 
 
 def forward(joint_position: Tensor) -> Tensor:
@@ -50,7 +57,7 @@ def forward(joint_position: Tensor) -> Tensor:
         )
     q = joint_position.unflatten(-1, (4, 3))
     hip, thigh, knee = q[..., 0], q[..., 1], q[..., 1] + q[..., 2]
-    side = torch.tensor(_SIDE, dtype=q.dtype, device=q.device) * constants.ABDUCTION
+    side = constant(_SIDEWAYS, q.device, q.dtype)
     sin_knee, cos_knee = torch.sin(knee), torch.cos(knee)
     x = -constants.THIGH * torch.sin(thigh) - constants.CALF * sin_knee + constants.FOOT_OFFSET_X * cos_knee
     z = -constants.THIGH * torch.cos(thigh) - constants.CALF * cos_knee - constants.FOOT_OFFSET_X * sin_knee
@@ -85,7 +92,7 @@ def inverse(feet: Tensor) -> Tensor:
     if feet.shape[-2:] != (4, 3):
         raise ValueError(f"feet must be [*B, 4, 3] (legs FL, FR, RL, RR), got {tuple(feet.shape)}")
     x, y, z = (feet - hip_positions(feet)).unbind(-1)
-    side = torch.tensor(_SIDE, dtype=feet.dtype, device=feet.device) * constants.ABDUCTION
+    side = constant(_SIDEWAYS, feet.device, feet.dtype)
     drop = (y * y + z * z - constants.ABDUCTION**2).clamp(min=0.0).sqrt()
     # In the leg's plane the foot is at (side, -drop) before the hip turns it to (y, z).
     hip = torch.atan2(z, y) - torch.atan2(-drop, side)
@@ -99,5 +106,5 @@ def inverse(feet: Tensor) -> Tensor:
     across, along = _SHANK * torch.sin(bend), constants.THIGH + _SHANK * torch.cos(bend)
     thigh = torch.atan2(-x, drop) - torch.atan2(across, along)
     # The shank points to the foot's centre, which the calf's own axis misses by a small constant angle.
-    calf = bend - torch.atan2(x.new_tensor(-constants.FOOT_OFFSET_X), x.new_tensor(constants.CALF))
+    calf = bend - math.atan2(-constants.FOOT_OFFSET_X, constants.CALF)
     return torch.stack((hip, thigh, calf), -1).flatten(-2)

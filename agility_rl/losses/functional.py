@@ -5,6 +5,7 @@ Every criterion returns one term per sample; the reduction belongs to the caller
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -201,7 +202,7 @@ def marginal_entropy(skill_logits: Tensor) -> Tensor:
     """
     log_probability = skill_logits.log_softmax(-1).flatten(0, -2)  # [N, K]
     # mean in the log domain: a skill that never occurs has probability 0 in float32, and 0 * log 0 is nan
-    log_mean = log_probability.logsumexp(0) - torch.log(torch.tensor(float(log_probability.shape[0])))
+    log_mean = log_probability.logsumexp(0) - math.log(log_probability.shape[0])
     return -(log_mean.exp() * log_mean).sum()
 
 

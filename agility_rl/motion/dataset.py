@@ -5,6 +5,7 @@ Every clip is turned into frames once; a sample is a gather from one tensor, wha
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -148,6 +149,22 @@ class MotionDataset:
         if labelled:
             self._states["root_height"] = torch.cat([clip.root_position[:, 2:] for clip in labelled])
 
+    @property
+    def device(self) -> torch.device:
+        """Where samples are drawn; generators have to be there too."""
+        return self._offsets.device
+
+    def to(self, device: torch.device | str) -> MotionDataset:
+        """The same motion on another device; the clips themselves stay where they are."""
+        moved = copy.copy(self)
+        for name in ("_offsets", "_present"):
+            setattr(moved, name, getattr(self, name).to(device))
+        for name in ("_labelled", "_unlabelled", "_labelled_table", "_unlabelled_table"):
+            part = getattr(self, name)
+            setattr(moved, name, type(part)(*(tensor.to(device) for tensor in part)))
+        moved._states = {name: value.to(device) for name, value in self._states.items()}
+        return moved
+
     def sample_unlabelled(self, n: int, generator: torch.Generator | None, *, as_recorded: bool = False) -> TensorDict:
         """``n`` samples of unlabelled motion.
 
@@ -162,9 +179,10 @@ class MotionDataset:
         """
         pool = self._unlabelled
         if self.as_recorded or as_recorded:
-            pick = torch.randint(len(pool.starts), (n,), generator=generator)
+            pick = torch.randint(len(pool.starts), (n,), generator=generator, device=self.device)
         else:
-            pick = _draw(self._unlabelled_table, torch.zeros(n, dtype=torch.int64), generator)
+            everyone = torch.zeros(n, dtype=torch.int64, device=self.device)
+            pick = _draw(self._unlabelled_table, everyone, generator)
         return TensorDict({keys.MOTION: self._gather(pool, pick)}, batch_size=[n])
 
     def sample_labelled(
@@ -183,8 +201,7 @@ class MotionDataset:
         Raises:
             MotionError: if no class with clips has a positive share.
         """
-        shares = torch.ones(NUM_BEHAVIOURS) if skill_probabilities is None else skill_probabilities.float()
-        shares = shares * self._present
+        shares = self._present.float() if skill_probabilities is None else skill_probabilities.float() * self._present
         if not bool(shares.sum() > 0):
             have = [name for name, there in zip(BEHAVIOURS, self._present.tolist(), strict=True) if there]
             raise MotionError(f"expected a positive share for a class with clips ({', '.join(have) or 'none'})")
@@ -214,8 +231,10 @@ class MotionDataset:
                 f"expected labelled clips of {BEHAVIOURS[int(absent[0])]!r} to start from, there are none"
             )
         pool, pick = self._labelled, _draw(self._labelled_table, skill, generator)
-        index = pool.starts[pick] + torch.randint(self.span + 1, pick.shape, generator=generator)
-        before = torch.maximum(index[:, None] + torch.arange(-self.span, 0), pool.clips[pick][:, None])
+        index = pool.starts[pick] + torch.randint(self.span + 1, pick.shape, generator=generator, device=self.device)
+        before = torch.maximum(
+            index[:, None] + torch.arange(-self.span, 0, device=self.device), pool.clips[pick][:, None]
+        )
         states = {name: value.index_select(0, index) for name, value in self._states.items()}
         return TensorDict(states | {"past_motion": pool.frames[before]}, batch_size=[len(skill)])
 
@@ -288,7 +307,7 @@ def _cumulative(pool: _Pool, num_groups: int) -> _Table:
 
 def _draw(table: _Table, group: Tensor, generator: torch.Generator | None) -> Tensor:
     """One start of each given group by its weight: one binary search each."""
-    uniform = torch.rand(group.shape, dtype=torch.float64, generator=generator)
+    uniform = torch.rand(group.shape, dtype=torch.float64, generator=generator, device=group.device)
     pick = torch.searchsorted(table.ends, group + uniform, right=True)
     return pick.clamp(table.first[group], table.last[group])
 

@@ -3,7 +3,7 @@
 from agility_rl.simulation.batch import BatchSimulator
 from agility_rl.simulation.depth_camera import DepthCamera
 from agility_rl.simulation.scenery import Hinge, Piece, Shape
-from agility_rl.simulation.simulator import PARAMETERS, Camera, Simulator, make_simulator
+from agility_rl.simulation.simulator import PARAMETERS, Camera, HardwareError, Simulator, make_simulator
 from agility_rl.simulation.terrain import HeightField, ridges, rough_pyramids
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "BatchSimulator",
     "Camera",
     "DepthCamera",
+    "HardwareError",
     "HeightField",
     "Hinge",
     "Piece",

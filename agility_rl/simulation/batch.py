@@ -70,7 +70,7 @@ class BatchSimulator:
     ) -> None:
         if num_simulations < 1:
             raise ValueError(f"num_simulations must be at least 1, got {num_simulations}")
-        self.num_simulations = num_simulations
+        self.num_simulations, self.device = num_simulations, torch.device("cpu")
         self.num_threads = num_threads or len(os.sched_getaffinity(0))
         self.world = World(control_dt=control_dt, sim_dt=sim_dt, terrain=terrain, scenery=scenery, **model_options)
         self.control_dt, self.sim_dt, self.substeps = control_dt, sim_dt, self.world.substeps

@@ -5,9 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor
 
 from agility_rl.simulation.scenery import Piece
+
+
+class HardwareError(ValueError):
+    """A simulator cannot run here: no such device, driver or library, or too little room; the message says what helps.
+
+    Example:
+        >>> issubclass(HardwareError, ValueError)
+        True
+    """
+
 
 PARAMETERS: dict[str, tuple[int, str]] = {
     "stiffness": (12, "N m/rad"),
@@ -58,6 +69,7 @@ class Simulator(Protocol):
 
     Attributes:
         num_simulations: N.
+        device: of every tensor, those that are given to it too.
         control_dt: seconds of one :meth:`step`.
         sim_dt: seconds of one physics step.
         ground_extent: half side of the square in which robots may start [m], which a height field reaches beyond by at
@@ -81,6 +93,7 @@ class Simulator(Protocol):
     """
 
     num_simulations: int
+    device: torch.device
     control_dt: float
     sim_dt: float
     ground_extent: float
@@ -168,7 +181,7 @@ def make_simulator(name: str = "batch", *, num_simulations: int, **options: Any)
 
     Raises:
         ValueError: if there is no simulator of this name.
-        ImportError: if it is not installed.
+        HardwareError: if it is not installed, or cannot run here.
 
     Example:
         >>> simulator = make_simulator(num_simulations=2, num_threads=1)
@@ -180,7 +193,10 @@ def make_simulator(name: str = "batch", *, num_simulations: int, **options: Any)
 
         return BatchSimulator(num_simulations, **options)
     if name == "warp":
-        from agility_rl.simulation.warp import WarpSimulator
+        try:
+            from agility_rl.simulation.warp import WarpSimulator
+        except ImportError as error:
+            raise HardwareError(str(error)) from error
 
         return WarpSimulator(num_simulations, **{key: options[key] for key in options if key != "num_threads"})
     raise ValueError(f"unknown simulator {name!r}; expected 'batch' (CPU) or 'warp' (NVIDIA GPU)")

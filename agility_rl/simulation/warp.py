@@ -15,6 +15,7 @@ from agility_rl.go2 import constants
 from agility_rl.go2.model import ROBOT_GROUP
 from agility_rl.simulation.parameters import FIELDS, SimulationParameters
 from agility_rl.simulation.scenery import Piece
+from agility_rl.simulation.simulator import HardwareError
 from agility_rl.simulation.terrain import HeightField
 from agility_rl.simulation.warp_camera import WarpDepthCamera
 from agility_rl.simulation.world import FORCES, JOINT_SPEEDS, JOINTS, World, check_finite, check_target
@@ -64,7 +65,7 @@ class WarpSimulator:
 
     Raises:
         ValueError: if the steps do not fit each other or a number is not positive.
-        RuntimeError: if there is no such device, or too little memory.
+        HardwareError: if there is no such device, or too little memory.
 
     Example:
         >>> simulator = WarpSimulator(2, device="cpu")
@@ -90,7 +91,7 @@ class WarpSimulator:
         for name, number in (("num_simulations", num_simulations), ("max_contacts", max_contacts)):
             if number < 1:
                 raise ValueError(f"{name} must be at least 1, got {number}")
-        self.num_simulations, self.device = num_simulations, _usable(device)
+        self.num_simulations, self.device = num_simulations, usable_device(device)
         self.world = World(control_dt=control_dt, sim_dt=sim_dt, terrain=terrain, scenery=scenery, **model_options)
         self.control_dt, self.sim_dt, self.substeps = control_dt, sim_dt, self.world.substeps
         self.ground_extent, self.scenery = self.world.ground_extent, self.world.scenery
@@ -103,7 +104,7 @@ class WarpSimulator:
                 self._model.opt.warn_overflow = 0  # reported by the log, once, with what helps
                 self._data = mjw.make_data(self.model, num_simulations, nconmax=max_contacts, njmax=rows)
         except RuntimeError as error:
-            raise RuntimeError(
+            raise HardwareError(
                 f"{num_simulations} simulations with {max_contacts} contacts each do not fit on {self.device}; give "
                 f"fewer robots or fewer max_contacts ({error})"
             ) from error
@@ -156,7 +157,7 @@ class WarpSimulator:
 
         Raises:
             ValueError: if ``target`` has another shape.
-            RuntimeError: if there were more contacts than there is room for (on a GPU, after 500 steps at the latest).
+            HardwareError: if there were more contacts than there is room for (on a GPU, after 500 steps at the latest).
         """
         check_target(target, self.num_simulations)
         delay = self._parameters.delay
@@ -193,11 +194,11 @@ class WarpSimulator:
         """Say once that constraints did not fit, or give up where contacts of anyone may be missing.
 
         Raises:
-            RuntimeError: if there were more contacts than there is room for.
+            HardwareError: if there were more contacts than there is room for.
         """
         if bool((self._seen & _OF_ALL).any()):
             contacts = self._data.naconmax // self.num_simulations
-            raise RuntimeError(
+            raise HardwareError(
                 f"more contacts than there is room for, and some were left out; give more max_contacts than {contacts}"
             )
         number = int(((self._seen & _OF_ONE) != 0).sum())
@@ -362,13 +363,16 @@ class WarpSimulator:
             self.__dict__.pop(name, None)
 
 
-def _usable(device: torch.device | str) -> torch.device:
+def usable_device(device: torch.device | str) -> torch.device:
     """The device, if torch and Warp can use it.
 
     Raises:
-        RuntimeError: saying what is missing.
+        HardwareError: saying what is missing.
     """
-    device = torch.device(device)
+    try:
+        device = torch.device(device)
+    except RuntimeError:
+        raise HardwareError(f"the simulator 'warp' runs on cuda, or on cpu for tests, got device {device!r}") from None
     if device.type == "cpu":
         return device
     if torch.version.cuda is None:
@@ -377,4 +381,4 @@ def _usable(device: torch.device | str) -> torch.device:
         lacks = "no NVIDIA driver answers (12.4 or newer is needed); look at nvidia-smi"
     else:
         return torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
-    raise RuntimeError(f"the simulator 'warp' cannot run on {device}: {lacks}, or take the simulator 'batch'")
+    raise HardwareError(f"the simulator 'warp' cannot run on {device}: {lacks}, or take the simulator 'batch'")

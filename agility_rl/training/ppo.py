@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.objectives import KLAdaptiveLR, LossModule
 
 from agility_rl.training import distributed
+from agility_rl.training.seeding import permutation
 
 Extra = Callable[[TensorDictBase], Tensor]
 
@@ -101,7 +102,7 @@ class PPOUpdate:
         device = advantage.device.type
         metrics: dict[str, Tensor] = {}
         for _ in range(self.epochs):
-            order = torch.randperm(flat.numel(), generator=generator)
+            order = permutation(flat.numel(), generator)
             for rows in order.split(size)[: self.minibatches]:
                 sample = flat[rows]
                 with torch.autocast(device, self.precision, enabled=self.precision is not torch.float32):

@@ -97,7 +97,7 @@ class Rollout:
 def _allocate(row: TensorDictBase, num_steps: int) -> TensorDictBase:
     return TensorDict(
         {
-            key: torch.empty((num_steps, *entry.shape), dtype=entry.dtype)
+            key: torch.empty((num_steps, *entry.shape), dtype=entry.dtype, device=entry.device)
             for key, entry in row.items(include_nested=True, leaves_only=True)
         },
         [num_steps, *row.batch_size],

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from agility_rl.training import distributed
 
@@ -90,18 +91,29 @@ class Seeds:
             self.numpy(name).bit_generator.state = value
 
 
-def seed_everything(seed: int) -> Seeds:
+def permutation(number: int, generator: torch.Generator) -> Tensor:
+    """The indices below a number in random order, int64 ``[number]``, where the generator is.
+
+    Example:
+        >>> sorted(permutation(3, torch.Generator()).tolist())
+        [0, 1, 2]
+    """
+    return torch.randperm(number, generator=generator, device=generator.device)
+
+
+def seed_everything(seed: int, device: torch.device | str = "cpu") -> Seeds:
     """Seed the global generators of Python, NumPy and torch (all devices) and return the named streams.
 
     Global generators serve the libraries that offer nothing else (initial weights of ``torch.nn``, TorchRL's policy
-    sampling); our own components take a generator from the streams. Every process has streams of its own.
+    sampling); our own components take a generator from the streams, which live on ``device``. Every process has streams
+    of its own.
 
     Example:
         >>> _ = seed_everything(3); first = torch.rand(1)
         >>> _ = seed_everything(3); bool(first == torch.rand(1))
         True
     """
-    seeds = Seeds(seed, rank=distributed.rank())
+    seeds = Seeds(seed, device, rank=distributed.rank())
     random.seed(seeds.integer("python"))
     np.random.seed(seeds.integer("numpy") % 2**32)  # noqa: NPY002  (the global state is what is seeded here)
     torch.manual_seed(seeds.integer("torch"))

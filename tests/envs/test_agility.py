@@ -303,7 +303,7 @@ def test_many_random_steps_stay_finite_and_drop_nobody_through_the_floor(build: 
 def test_wrong_arguments_are_refused(build: Build) -> None:
     with pytest.raises(ValueError, match="holds 2 robots, expected 3"):
         build(3, simulator=make_simulator(num_simulations=2, num_threads=1))
-    with pytest.raises(ValueError, match="must hold the scenery of course 'full'"):
+    with pytest.raises(ValueError, match="must hold scenery\\(course\\) of 'full'"):
         build(2, simulator=make_simulator(num_simulations=2, num_threads=1))
     with pytest.raises(ValueError, match="decision_steps"):
         build(1, decision_steps=0)

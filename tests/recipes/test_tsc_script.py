@@ -55,6 +55,19 @@ def test_own_says_nothing_but_before_the_obstacles_it_names(script: Any) -> None
     assert chosen.behaviours == ("canter",) and not chosen.complete and script.parse("trot:1.2").complete
 
 
+def test_a_second_decision_turns_to_way_points_that_are_aside(script: Any) -> None:
+    chosen = script.parse("own,bar_jump=canter:1.6/trot:0.7,tunnel=own/pace:0.5")
+    kinds = ["bar_jump"] * 3 + ["tunnel"] * 2 + ["seesaw"]
+    action = chosen.decide(seen(kinds, [0.49, 0.51, -0.51, 0.4, 0.6, 3.0]))["action"]
+    named = [BEHAVIOURS[index] if index >= 0 else "own" for index in action["behaviour"].tolist()]
+    assert named == ["canter", "trot", "trot", "own", "pace", "own"]
+    assert chosen.behaviours == ("pace", "trot", "canter") and not chosen.complete
+    parameters = action["parameters"].take_along_dim(action["behaviour"].clamp(min=0)[:, None, None], 1)[:, 0]
+    command, _ = commands_from_parameters(action["behaviour"].clamp(min=0), parameters)
+    assert command[:3, 0].tolist() == pytest.approx([1.6, 0.7, 0.7])
+    assert command[:3, 2].tolist() == pytest.approx([0.5, 1.02, -1.02])  # a canter's turn rate ends at 0.5
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -64,6 +77,7 @@ def test_own_says_nothing_but_before_the_obstacles_it_names(script: Any) -> None
         ("trot:1.7", r"--script: trot goes at 0.5 to 1.5 m/s \(Table S2\), got 1.7 m/s"),
         ("trot:1.2,hoop=jump:1.0", r"--script: unknown obstacle 'hoop' in .*, expected bar_jump, a_frame"),
         ("trot:1.2,tunnel", r"expected BEHAVIOUR:SPEED such as trot:1.2"),
+        ("trot:1.2/", r"expected BEHAVIOUR:SPEED such as trot:1.2, got 'trot:1.2/'"),
     ],
 )
 def test_what_is_no_script_is_refused(script: Any, text: str, message: str) -> None:

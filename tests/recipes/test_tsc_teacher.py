@@ -59,6 +59,12 @@ def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
     parent = recipe.train(replace(smoke, iterations=1))
     child = recipe.train(replace(smoke, name="child", iterations=1, init_from=parent))
     assert Artifact.load(child / "policy").manifest["course"] == "full"
+    broad = replace(smoke.ppo, initial_std=0.5, min_std=0.4)
+    wide = recipe.train(replace(smoke, name="wide", iterations=0, init_from=parent, ppo=broad))
+    head = "actor.module.0.module.parameters_head."
+    started = Artifact.load(wide / "policy").state  # the parent's floor was 0.1, its deviation 0.3
+    for name in ("min_std", "std"):
+        assert started[head + name].tolist() == pytest.approx([0.4] * 30), name
     alone = recipe.train(
         replace(smoke, name="trot", behaviours=("trot",), env=replace(smoke.env, course="box"), iterations=1)
     )

@@ -10,7 +10,7 @@ import torch
 from agility_rl import rotations
 from agility_rl.envs import COURSES, LocomotionEnv
 from agility_rl.envs.layout import CourseLayout
-from agility_rl.simulation import PARAMETERS, BatchSimulator, make_simulator, rough_pyramids
+from agility_rl.simulation import PARAMETERS, BatchSimulator, HardwareError, make_simulator, rough_pyramids
 from tests.simulation.robot_states import POSE, assert_same, everyone, only, snapshot, standing, targets
 
 pytest.importorskip("mujoco_warp", reason="the extra gpu is not installed")
@@ -178,7 +178,7 @@ def test_too_little_room_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     assert "give more max_constraints than 16" in caplog.text
     simulator = WarpSimulator(2, device="cpu", max_contacts=8)
     simulator.reset(everyone(2), **in_the_ground)
-    with pytest.raises(RuntimeError, match="and some were left out; give more max_contacts than 8"):
+    with pytest.raises(HardwareError, match="and some were left out; give more max_contacts than 8"):
         simulator.step(POSE.expand(2, 12))
 
 
@@ -228,6 +228,11 @@ def test_what_cannot_be_simulated_is_refused() -> None:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="here is a GPU")
 def test_a_missing_gpu_is_named() -> None:
     with pytest.raises(
-        RuntimeError, match=r"the simulator 'warp' cannot run on cuda: .*, or take the simulator 'batch'"
+        HardwareError, match=r"the simulator 'warp' cannot run on cuda: .*, or take the simulator 'batch'"
     ):
         WarpSimulator(1)
+
+
+def test_a_device_that_is_none_is_named() -> None:
+    with pytest.raises(HardwareError, match="runs on cuda, or on cpu for tests, got device 'gpu'"):
+        WarpSimulator(1, device="gpu")
