@@ -35,7 +35,7 @@ from agility_rl.envs import COURSES, LocomotionEnv
 from agility_rl.envs.layout import CourseLayout
 from agility_rl.go2 import constants, features
 from agility_rl.go2.model import build_spec
-from agility_rl.simulation import Simulator, make_simulator, rough_pyramids
+from agility_rl.simulation import Simulator, make_simulator, rough_pyramids, simulator_device
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 from rollouts import drive, load_controller
@@ -116,7 +116,7 @@ def statistics_of(args: argparse.Namespace, engine: str, rough: bool) -> dict[st
     alive = torch.zeros(robots)
     feet = list(constants.FOOT_GROUPS)
     steps = round(args.seconds / constants.CONTROL_DT)
-    for td in drive(controller.bbc, env, [(steps, skill, command)]):
+    for td in drive(controller.bbc.to(env.device), env, [(steps, skill, command)]):
         fell |= td["terminated"][:, 0].cpu()
         up = (~fell).float()
         alive += up
@@ -155,7 +155,7 @@ def bare_step(engine: str, args: argparse.Namespace) -> Callable[[Tensor], None]
             batch.step(nstep=substeps)
 
         return step_batch
-    device = torch.device(args.device)
+    device = simulator_device("warp", args.device)
     with warp.ScopedDevice(warp.device_from_torch(device)):
         there = mujoco_warp.put_model(model)
         data = mujoco_warp.make_data(model, args.robots, nconmax=48, njmax=306)
@@ -183,10 +183,10 @@ def bare_step(engine: str, args: argparse.Namespace) -> Callable[[Tensor], None]
 def env_step(env: LocomotionEnv) -> Callable[[Tensor], None]:
     """Observations and rewards too, without resets."""
     env.reset()
-    scale = torch.tensor(constants.ACTION_SCALE)
+    pose, scale = POSE.to(env.device), torch.tensor(constants.ACTION_SCALE, device=env.device)
 
     def step(target: Tensor) -> None:
-        env.step(TensorDict({keys.ACTION: (target - POSE) / scale}, [env.num_robots]))
+        env.step(TensorDict({keys.ACTION: (target - pose) / scale}, [env.num_robots]))
 
     return step
 

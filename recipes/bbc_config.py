@@ -96,7 +96,7 @@ class PPOConfig:
     value: float = 1.0
     max_grad_norm: float = 1.0
     precision: Precision = "float32"
-    """Of the hidden layers in the update; ``auto`` is bfloat16 on a CPU that multiplies in it, about twice as fast."""
+    """Of the hidden layers in the update; ``auto`` is bfloat16 on hardware that multiplies in it."""
     initial_std: float = 1.0
     min_std: float = 0.1
     hidden: tuple[int, ...] = (512, 256, 128)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import torch
 
-from agility_rl.simulation import HardwareError
+from agility_rl.simulation import simulator_device
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,7 @@ def training_device(cfg: HardwareConfig) -> torch.device:
     Raises:
         HardwareError: if ``warp`` is not installed or there is no such device, saying what is missing.
     """
-    if cfg.simulator == "batch":
-        return torch.device("cpu")
-    try:
-        from agility_rl.simulation.warp import usable_device
-    except ImportError as error:
-        raise HardwareError(str(error)) from error
-    return usable_device(cfg.device)
+    return simulator_device(cfg.simulator, cfg.device)
 
 
 def simulator_options(cfg: HardwareConfig, num_threads: int | None) -> dict[str, Any]:

@@ -77,8 +77,9 @@ def _found(content: Mapping[str, Any], parameters: Mapping[str, Any]) -> Simulat
     root = vectors * values.clamp_min(0.0).sqrt()
 
     def draw(count: int, generator: torch.Generator) -> dict[str, Tensor]:
-        normal = torch.randn((count, len(mean)), generator=generator, dtype=torch.float64)
-        return space.fields(space.denormalize(mean + normal @ root.mT))
+        shape, device = (count, len(mean)), generator.device
+        normal = torch.randn(shape, generator=generator, dtype=torch.float64, device=device).cpu()
+        return _there(space.fields(space.denormalize(mean + normal @ root.mT)), device)
 
     return SimulatorFile(draw, content.get("model", {}), _describe(parameters, "mean"))
 
@@ -88,9 +89,13 @@ def _truth(content: Mapping[str, Any], parameters: Mapping[str, Any]) -> Simulat
     values = torch.tensor([[float(entry["value"]) for entry in parameters.values()]], dtype=torch.float64)
 
     def draw(count: int, generator: torch.Generator) -> dict[str, Tensor]:
-        return space.fields(values.expand(count, -1))
+        return _there(space.fields(values.expand(count, -1)), generator.device)
 
     return SimulatorFile(draw, dict(content["recording"]["model"]), _describe(parameters, "value"))
+
+
+def _there(fields: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
+    return {name: value.to(device) for name, value in fields.items()}
 
 
 def _describe(parameters: Mapping[str, Any], key: str) -> str:

@@ -62,7 +62,7 @@ class PPOConfig:
     value: float = 1.0
     max_grad_norm: float = 1.0
     precision: Precision = "float32"
-    """Of the hidden layers in the update; ``auto`` is bfloat16 on a CPU that multiplies in it, about twice as fast."""
+    """Of the hidden layers in the update; ``auto`` is bfloat16 on hardware that multiplies in it."""
     initial_std: float = 1.0
     """At the start; a teacher of ``--init-from`` that has more begins with this."""
     min_std: float = 0.1

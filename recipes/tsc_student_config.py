@@ -138,7 +138,7 @@ class Config(HardwareConfig):
     bits: Literal[8, 16] = 8
     """How images are stored."""
     precision: Precision = "float32"
-    """Of the depth encoder's layers; ``auto`` is bfloat16 on a CPU that multiplies in it, about twice as fast."""
+    """Of the depth encoder's layers; ``auto`` is bfloat16 on hardware that multiplies in it."""
     memory: int = 512
     """Units of the GRU (supplement S6)."""
     encoder_hidden: int = 128

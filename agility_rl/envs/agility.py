@@ -64,7 +64,7 @@ class AgilityEnv(EnvBase):
         num_robots: N.
         controller: the Basic Behaviour Controller, deterministic; called without gradients.
         course: what stands where.
-        simulator: ready simulator that holds the course's pieces, or ``None`` for the CPU one built with
+        simulator: ready simulator that holds the course's pieces, or ``None`` for one built with
             ``simulator_options``.
         simulator_options: keyword arguments of :func:`agility_rl.simulation.make_simulator`.
         decision_steps: control steps of a decision; 1 decides at 50 Hz.
@@ -161,6 +161,7 @@ class AgilityEnv(EnvBase):
         def group(*shape: int) -> Unbounded:
             return Unbounded((n, *shape), dtype=torch.float32)
 
+        image = (n, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)
         skill = Categorical(behaviours.NUM_BEHAVIOURS, shape=(n,), dtype=torch.int64)
         self.observation_spec = Composite(
             {
@@ -177,13 +178,10 @@ class AgilityEnv(EnvBase):
                 keys.OBSTACLE: group(len(OBSTACLES)),
                 keys.SCANDOTS: group(NUM_SCANDOTS),
                 **outcome_specs(n, (*self.rewards, TERMINATION_TERM), self.terminations),
+                **({} if self.depth is None else {keys.DEPTH: Bounded(-0.5, 0.5, image, dtype=torch.float32)}),
             },
             shape=(n,),
         )
-        if self.depth is not None:
-            self.observation_spec[keys.DEPTH] = Bounded(
-                -0.5, 0.5, (n, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH), dtype=torch.float32
-            )
         parameters = group(behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS)
         decision = Composite({keys.BEHAVIOUR: skill.clone(), keys.PARAMETERS: parameters}, shape=(n,))
         self.full_action_spec = Composite({keys.ACTION: decision}, shape=(n,))

@@ -32,7 +32,7 @@ class Arena:
     Args:
         course: what stands where.
         num_robots: N.
-        generator: source of randomness.
+        generator: source of randomness; where it is, the tensors are.
         goal_radius: distance at which a way-point is reached [m].
         start: before a random obstacle, or before the first.
         start_spread: how many times as far aside and turned as released; 4 covers how robots leave the obstacle before.

@@ -20,7 +20,7 @@ class CommandSampler:
 
     Args:
         num_robots: N.
-        generator: source of randomness.
+        generator: source of randomness; where it is, the tensors are.
         period: control steps between two redraws; ``None`` never redraws by itself.
 
     Attributes:

@@ -24,7 +24,7 @@ class Decisions:
 
     Args:
         num_robots: N.
-        generator: source of the command noise.
+        generator: source of the command noise; where it is, the tensors are.
         noise: lowest and highest factor on each command.
 
     Attributes:

@@ -25,7 +25,7 @@ class DepthObservation:
 
     Args:
         simulator: where the robots live.
-        generator: source of randomness.
+        generator: source of randomness; where it is, the tensors are.
         decision_steps: control steps between two observations.
         frame_steps: control steps between two frames of the camera; 1 is 50 Hz.
         latency: fewest and most control steps by which an image is late; (1, 1) as released.

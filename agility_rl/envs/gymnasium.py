@@ -163,7 +163,7 @@ class LocomotionVectorEnv(VectorEnv):
 
         # All robots share one physics step, those that wait for their next episode too: they are placed anew below.
         action = action.clamp(-self._limit, self._limit).masked_fill(starting[:, None], 0.0)
-        after = self.env.step(TensorDict({keys.ACTION: action}, [self.num_envs]))["next"]
+        after = self.env.step(TensorDict({keys.ACTION: action.to(self.env.device)}, [self.num_envs]))["next"].cpu()
         self._observation = {name: after[name] for name in self.groups}
         reward = after["reward"][:, 0].masked_fill(starting, 0.0)
         terminated, truncated = (after[name][:, 0] & ~starting for name in ("terminated", "truncated"))
@@ -182,7 +182,7 @@ class LocomotionVectorEnv(VectorEnv):
 
     def _begin(self, mask: Tensor) -> None:
         """Start episodes of the rows of a bool mask, and leave the observations of the others as they are."""
-        fresh = self.env.reset(TensorDict({"_reset": mask[:, None]}, [self.num_envs]))
+        fresh = self.env.reset(TensorDict({"_reset": mask[:, None].to(self.env.device)}, [self.num_envs])).cpu()
         for name in self.groups:
             row = mask.view(-1, *(1,) * (fresh[name].ndim - 1))
             self._observation[name] = torch.where(row, fresh[name], self._observation.get(name, fresh[name]))

@@ -27,7 +27,7 @@ class CourseLayout:
     Args:
         course: what to draw.
         num_robots: N.
-        generator: source of randomness.
+        generator: source of randomness; where it is, the tensors are.
 
     Attributes:
         pieces: what the simulator must hold.
@@ -85,9 +85,8 @@ class CourseLayout:
         def uniform(*shape: int) -> Tensor:
             return torch.rand(shape, generator=self.generator, device=self.device)
 
-        # of each obstacle
-        slot = uniform(n, k) if self.course.shuffle else torch.arange(k, device=self.device).repeat(n, 1)
-        slot = slot.argsort(-1)
+        order = uniform(n, k) if self.course.shuffle else torch.arange(k, device=self.device).repeat(n, 1)
+        slot = order.argsort(-1)  # of each obstacle
         place = self._place[slot] + self._jitter[slot] * (2.0 * uniform(n, k, 3) - 1.0)
         low, high = self._heights.unbind(-1)
         lift = low + (high - low) * self.difficulty * uniform(n, k)

@@ -43,7 +43,7 @@ class LocomotionEnv(EnvBase):
 
     Args:
         num_robots: N.
-        simulator: ready simulator, or ``None`` for the CPU one built with ``simulator_options``.
+        simulator: ready simulator, or ``None`` for one built with ``simulator_options``.
         simulator_options: keyword arguments of :func:`agility_rl.simulation.make_simulator`.
         reference: states for reference-state initialisation as :class:`ReferenceStates` takes them; ``None`` starts
             from standing.
@@ -154,8 +154,8 @@ class LocomotionEnv(EnvBase):
             command: ``[N, 5]`` in the order and units of :data:`agility_rl.behaviours.COMMANDS`.
             shift: ``[N, 1]`` in [-1, 1], zero if not given.
         """
-        shift = torch.zeros(self.num_robots, 1, device=self.device) if shift is None else shift
-        self.commands.assign(self._everyone(), skill, command, shift)
+        shift = torch.zeros(self.num_robots, 1) if shift is None else shift
+        self.commands.assign(self._everyone(), *(given.to(self.device) for given in (skill, command, shift)))
 
     def set_skill_probabilities(self, probabilities: Tensor) -> None:
         """Draw future skills from ``[5]`` probabilities (the skill prior)."""

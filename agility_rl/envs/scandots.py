@@ -107,11 +107,10 @@ class HeightScan:
         return torch.addcmul(base, gain, parameter[:, None])
 
     def _with_walls(self, heights: Tensor, position: Tensor, yaw: Tensor) -> Tensor:
-        size = self._size
         rim = self._ahead + self._radius
-        close = ((position < rim) | (position > size - rim)).any(-1).nonzero()[:, 0]
+        close = ((position < rim) | (position > self._size - rim)).any(-1).nonzero()[:, 0]
         points = _frame(yaw[close], position[close]) @ self._grid  # [M, 2, 132]
-        outside = ((points < 0.0) | (points > size[:, None])).any(1)
+        outside = ((points < 0.0) | (points > self._size[:, None])).any(1)
         wall = torch.where(outside, self.layout.wall_height[close, None], 0.0)
         return heights.index_copy_(0, close, torch.maximum(heights[close], wall))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from agility_rl.losses.functional import gradient_penalty
@@ -30,6 +30,27 @@ class KeyedLoss(LossModule):
     @in_keys.setter
     def in_keys(self, values: list[NestedKey]) -> None:
         self._in_keys = values
+
+    def register_coeff_buffer(
+        self,
+        name: str,
+        value: float | Tensor | None,
+        *,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        """As TorchRL's, beside the parameters: a number on the CPU cannot be the bound of a tensor on a GPU."""
+        super().register_coeff_buffer(name, value, device=device or parameter_device(self), dtype=dtype)
+
+
+def parameter_device(module: nn.Module) -> torch.device | None:
+    """Where a module's parameters are; ``None`` if it has none.
+
+    Example:
+        >>> parameter_device(nn.Linear(2, 1))
+        device(type='cpu')
+    """
+    return next((parameter.device for parameter in module.parameters()), None)
 
 
 def penalized_logit(

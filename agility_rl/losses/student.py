@@ -20,7 +20,7 @@ from agility_rl.keys import (
     OBSTACLE_LOGITS,
     PARAMETERS,
 )
-from agility_rl.losses.keyed import KeyedLoss
+from agility_rl.losses.keyed import KeyedLoss, parameter_device
 
 
 class StudentLoss(KeyedLoss):
@@ -129,7 +129,7 @@ class StudentLoss(KeyedLoss):
                 setattr(self, name, None)
             else:
                 self.register_coeff_buffer(name, value)
-        self.register_buffer("heading_weights", torch.tensor(heading_weights))
+        self.register_buffer("heading_weights", torch.tensor(heading_weights, device=parameter_device(self)))
         self._set_in_keys()
 
     def _set_in_keys(self) -> None:

@@ -3,7 +3,14 @@
 from agility_rl.simulation.batch import BatchSimulator
 from agility_rl.simulation.depth_camera import DepthCamera
 from agility_rl.simulation.scenery import Hinge, Piece, Shape
-from agility_rl.simulation.simulator import PARAMETERS, Camera, HardwareError, Simulator, make_simulator
+from agility_rl.simulation.simulator import (
+    PARAMETERS,
+    Camera,
+    HardwareError,
+    Simulator,
+    make_simulator,
+    simulator_device,
+)
 from agility_rl.simulation.terrain import HeightField, ridges, rough_pyramids
 
 __all__ = [
@@ -20,4 +27,5 @@ __all__ = [
     "make_simulator",
     "ridges",
     "rough_pyramids",
+    "simulator_device",
 ]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -20,6 +21,7 @@ class HardwareError(ValueError):
     """
 
 
+_UNKNOWN = "unknown simulator {!r}; expected 'batch' (CPU) or 'warp' (NVIDIA GPU)"
 PARAMETERS: dict[str, tuple[int, str]] = {
     "stiffness": (12, "N m/rad"),
     "damping": (12, "N m s/rad"),
@@ -193,10 +195,40 @@ def make_simulator(name: str = "batch", *, num_simulations: int, **options: Any)
 
         return BatchSimulator(num_simulations, **options)
     if name == "warp":
-        try:
+        with _installed():
             from agility_rl.simulation.warp import WarpSimulator
-        except ImportError as error:
-            raise HardwareError(str(error)) from error
 
         return WarpSimulator(num_simulations, **{key: options[key] for key in options if key != "num_threads"})
-    raise ValueError(f"unknown simulator {name!r}; expected 'batch' (CPU) or 'warp' (NVIDIA GPU)")
+    raise ValueError(_UNKNOWN.format(name))
+
+
+def simulator_device(name: str, device: torch.device | str = "cuda") -> torch.device:
+    """Where the tensors of a simulator would be.
+
+    Args:
+        name: as of :func:`make_simulator`.
+        device: wanted for ``"warp"``; ``"batch"`` is on the CPU.
+
+    Raises:
+        ValueError: if there is no simulator of this name.
+        HardwareError: if it is not installed, or cannot run there.
+
+    Example:
+        >>> simulator_device("batch"), simulator_device("warp", "cpu")
+        (device(type='cpu'), device(type='cpu'))
+    """
+    if name == "batch":
+        return torch.device("cpu")
+    if name != "warp":
+        raise ValueError(_UNKNOWN.format(name))
+    with _installed():
+        from agility_rl.simulation.warp_device import usable_device
+    return usable_device(device)
+
+
+@contextlib.contextmanager
+def _installed() -> Iterator[None]:
+    try:
+        yield
+    except ImportError as error:
+        raise HardwareError(str(error)) from error

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -18,15 +17,8 @@ from agility_rl.simulation.scenery import Piece
 from agility_rl.simulation.simulator import HardwareError
 from agility_rl.simulation.terrain import HeightField
 from agility_rl.simulation.warp_camera import WarpDepthCamera
+from agility_rl.simulation.warp_device import mjw, on_device, usable_device, wp
 from agility_rl.simulation.world import FORCES, JOINT_SPEEDS, JOINTS, World, check_finite, check_target
-
-try:
-    import warp as wp
-
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_ERROR)  # not a line for each kernel that is compiled
-    import mujoco_warp as mjw
-except ImportError as error:
-    raise ImportError("the simulator 'warp' needs mujoco-warp: pip install 'agility_rl[gpu]'") from error
 
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 """Fields that :func:`mujoco_warp.set_const` computes from :data:`agility_rl.simulation.parameters.FIELDS`."""
@@ -99,7 +91,7 @@ class WarpSimulator:
         self.model: mujoco.MjModel = self.world.model
         rows = 6 * max_contacts + self.model.nv if max_constraints is None else max_constraints
         try:
-            with self._on_device():
+            with on_device(self.device):
                 self._model = mjw.put_model(self.model, dict.fromkeys((*FIELDS, *_DERIVED), num_simulations))
                 self._model.opt.warn_overflow = 0  # reported by the log, once, with what helps
                 self._data = mjw.make_data(self.model, num_simulations, nconmax=max_contacts, njmax=rows)
@@ -122,32 +114,26 @@ class WarpSimulator:
         self.unstable = torch.zeros(num_simulations, dtype=torch.bool, device=self.device)
         self._seen, self._steps, self._told = torch.zeros_like(self._flags), 0, False
         self._graph = self._capture()
-        with self._on_device():
+        with on_device(self.device):
             mjw.forward(self._model, data)
         self._read()
 
     def _field(self, name: str) -> Tensor:
         return wp.to_torch(getattr(self._model, name))
 
-    @contextlib.contextmanager
-    def _on_device(self) -> Iterator[None]:
-        """Warp launches on torch's device, in torch's present stream."""
-        with wp.ScopedDevice(wp.device_from_torch(self.device)):
-            if self.device.type != "cuda":
-                yield
-                return
-            with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.device))):
-                yield
-
     def _capture(self) -> Any:
         """A physics step as a CUDA graph; ``None`` on the CPU. The state stays as it is."""
         if self.device.type != "cuda":
             return None
         kept = [array.clone() for array in (self._qpos, self._qvel, self._warmstart)]
-        with self._on_device():
+        torch.cuda.synchronize(self.device)
+        with wp.ScopedDevice(
+            wp.device_from_torch(self.device)
+        ):  # on Warp's stream: torch's default one is not captured
             mjw.step(self._model, self._data)  # compiles what a capture could not
             with wp.ScopedCapture() as capture:
                 mjw.step(self._model, self._data)
+        torch.cuda.synchronize(self.device)
         for array, before in zip((self._qpos, self._qvel, self._warmstart), kept, strict=True):
             array.copy_(before)
         return capture.graph
@@ -163,7 +149,7 @@ class WarpSimulator:
         delay = self._parameters.delay
         self._flags.zero_()
         self._ctrl.copy_(target)
-        with self._on_device():
+        with on_device(self.device):
             for index in range(self.substeps):
                 if delay is not None:
                     self._ctrl.copy_(torch.where(delay[:, None] <= index, target, self._previous_target))
@@ -276,7 +262,7 @@ class WarpSimulator:
             ValueError: if a parameter is unknown or has a wrong shape.
         """
         if self._parameters.set(mask, fields):
-            with self._on_device():
+            with on_device(self.device):
                 mjw.set_const(self._model, self._data)
 
     def parameter(self, name: str) -> Tensor:
@@ -300,7 +286,7 @@ class WarpSimulator:
         way = wp.from_torch(torch.nn.functional.normalize(direction.float(), dim=-1).contiguous(), dtype=wp.vec3)
         groups = [1.0] * 6
         groups[ROBOT_GROUP] = 0.0
-        with self._on_device():
+        with on_device(self.device):
             mjw.kinematics(self._model, self._data)
             distance = wp.empty((n, rays), dtype=float)
             shape, normal = wp.empty((n, rays), dtype=int), wp.empty((n, rays), dtype=wp.vec3)
@@ -361,24 +347,3 @@ class WarpSimulator:
         """Release memory; the simulator cannot be used afterwards."""
         for name in ("_graph", "_data", "_model"):
             self.__dict__.pop(name, None)
-
-
-def usable_device(device: torch.device | str) -> torch.device:
-    """The device, if torch and Warp can use it.
-
-    Raises:
-        HardwareError: saying what is missing.
-    """
-    try:
-        device = torch.device(device)
-    except RuntimeError:
-        raise HardwareError(f"the simulator 'warp' runs on cuda, or on cpu for tests, got device {device!r}") from None
-    if device.type == "cpu":
-        return device
-    if torch.version.cuda is None:
-        lacks = f"this PyTorch ({torch.__version__}) is built without CUDA; install one with it"
-    elif not torch.cuda.is_available() or not wp.is_cuda_available():
-        lacks = "no NVIDIA driver answers (12.4 or newer is needed); look at nvidia-smi"
-    else:
-        return torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
-    raise HardwareError(f"the simulator 'warp' cannot run on {device}: {lacks}, or take the simulator 'batch'")

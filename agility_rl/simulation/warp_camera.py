@@ -12,12 +12,7 @@ from torch import Tensor
 from agility_rl.go2 import camera
 from agility_rl.rotations import multiply
 from agility_rl.simulation.depth_camera import CAMERA, FORWARD, camera_spec
-
-try:
-    import mujoco_warp as mjw
-    import warp as wp
-except ImportError as error:
-    raise ImportError("the simulator 'warp' needs mujoco-warp: pip install 'agility_rl[gpu]'") from error
+from agility_rl.simulation.warp_device import mjw, on_device, wp
 
 
 class WarpDepthCamera:
@@ -48,8 +43,8 @@ class WarpDepthCamera:
         spec.camera(CAMERA).principal_pixel = (camera.IMAGE_WIDTH / 2.0 - right, down - camera.IMAGE_HEIGHT / 2.0)
         self.model: mujoco.MjModel = spec.compile()
         number = source.nworld
-        self._device = wp.device_from_torch(device)
-        with wp.ScopedDevice(self._device):
+        self._device = device
+        with on_device(device):
             self._model = mjw.put_model(self.model, {"cam_quat": number})
             self._data = mjw.make_data(self.model, number, nconmax=1, njmax=1)
             self._context = mjw.create_render_context(
@@ -81,7 +76,7 @@ class WarpDepthCamera:
         Returns:
             float32 ``[M, 58, 87]``, distance along the optical axis [m]; infinite where nothing is.
         """
-        with wp.ScopedDevice(self._device):
+        with on_device(self._device):
             for name in ("qpos", "mocap_pos", "mocap_quat"):
                 wp.copy(getattr(self._data, name), getattr(self._source, name))
             mjw.kinematics(self._model, self._data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -43,3 +44,15 @@ def test_keys_can_be_replaced() -> None:
     loss = Loss()
     loss.in_keys = [("nested", "b")]
     assert loss.in_keys == [("nested", "b")]
+
+
+def test_numbers_of_a_loss_are_where_its_networks_are() -> None:
+    class Loss(KeyedLoss):
+        def __init__(self, network: TensorDictModule) -> None:
+            super().__init__()
+            self.network = network
+            self.register_coeff_buffer("bound", 0.2)
+
+    layer = nn.Linear(2, 1, device="meta")  # a device that needs no hardware
+    elsewhere = Loss(TensorDictModule(layer, in_keys=["x"], out_keys=["y"]))
+    assert elsewhere.bound.device.type == "meta" and Loss(linear()).bound.item() == pytest.approx(0.2)

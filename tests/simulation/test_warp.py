@@ -223,16 +223,3 @@ def test_what_cannot_be_simulated_is_refused() -> None:
     with pytest.raises(ValueError, match=r"target must be \[2, 12\], got \[3, 12\]"):
         simulator.step(POSE.expand(3, 12))
     simulator.close()
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="here is a GPU")
-def test_a_missing_gpu_is_named() -> None:
-    with pytest.raises(
-        HardwareError, match=r"the simulator 'warp' cannot run on cuda: .*, or take the simulator 'batch'"
-    ):
-        WarpSimulator(1)
-
-
-def test_a_device_that_is_none_is_named() -> None:
-    with pytest.raises(HardwareError, match="runs on cuda, or on cpu for tests, got device 'gpu'"):
-        WarpSimulator(1, device="gpu")
