@@ -1,5 +1,6 @@
 # Two commands on a bare machine that has Python 3.11 or newer (with venv) and make:
-#   make quickstart    set up, train a small controller on synthetic gaits (about five minutes), evaluate it, report
+#   make quickstart    set up, train a small controller on synthetic gaits (about five minutes), evaluate it, let the
+#                      pretrained student run the agility course, report both
 #   make test          set up, lint, type check, test
 # pip is configured as usual, by its own settings (for example PIP_INDEX_URL, or a pip.conf).
 
@@ -26,6 +27,7 @@ $(READY): pyproject.toml constraints.txt
 quickstart: setup
 	$(PYTHON) recipes/bbc_pretrain.py quickstart --name $(NAME)
 	$(PYTHON) recipes/evaluate.py runs/$(NAME)
+	$(PYTHON) recipes/evaluate_course.py pretrained/student --course full each --episodes 20 --episode-length 30 --output runs/$(NAME)/course
 	$(PYTHON) recipes/report.py runs/$(NAME)
 	@echo "report: $(CURDIR)/runs/$(NAME)/report.html"
 

@@ -1,6 +1,7 @@
-"""One HTML page of a run, with everything inside: targets, gaits, tracking, learning curves, settings.
+"""One HTML page of a run, with everything inside: targets, gaits, tracking, courses, learning curves, settings.
 
-In:  a run folder of ``bbc_pretrain.py``, best after ``evaluate.py``, whose results and pictures the page shows.
+In:  a run folder of ``bbc_pretrain.py``, ``tsc_teacher.py`` or ``tsc_student.py``, best after ``evaluate.py`` or
+     ``evaluate_course.py``, whose results and pictures the page shows; what was evaluated into ``RUN/course`` too.
 Out: ``RUN/report.html``, a single file that needs no network; an earlier one is replaced.
 
     python recipes/report.py runs/my_run
@@ -8,10 +9,8 @@ Out: ``RUN/report.html``, a single file that needs no network; an earlier one is
 
 from __future__ import annotations
 
-import base64
-import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -19,6 +18,8 @@ from typing import Annotated, Any
 
 import torch
 import tyro
+from course_report import course_results
+from html_page import Markup, document, drawn, interval, note, picture, table
 from judgement import show
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -29,18 +30,8 @@ from agility_rl.record.plots import Curves, learning_curves
 from agility_rl.training import cli
 from agility_rl.training.checkpoint import publish
 
-STYLE = """
-:root { --ink: #1d2530; --faint: #6b7685; --line: #dde2e8; --good: #1a7f4b; --bad: #b3261e; --card: #f6f8fa; }
-body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); max-width: 1080px; margin: 2rem auto; padding: 0 1rem; }
-h1 { margin-bottom: 0; } h2 { margin-top: 2.5rem; border-bottom: 1px solid var(--line); padding-bottom: .2rem; }
-table { border-collapse: collapse; margin: .8rem 0; font-variant-numeric: tabular-nums; }
-th, td { padding: .25rem .7rem; border-bottom: 1px solid var(--line); text-align: right; }
-th:first-child, td:first-child { text-align: left; } th { font-weight: 600; }
-img { max-width: 100%; height: auto; } figure { margin: 1rem 0; } figcaption, .note { color: var(--faint); }
-.pass { color: var(--good); font-weight: 600; } .fail { color: var(--bad); font-weight: 600; }
-.headline { background: var(--card); padding: .8rem 1rem; border-radius: 6px; }
-.scroll { overflow-x: auto; } pre { background: var(--card); padding: 1rem; overflow-x: auto; font-size: 13px; }
-"""
+COURSE = "course"
+"""Folder of a run in which another controller was evaluated on courses: ``evaluate_course.py --output RUN/course``."""
 GROUPS = {
     "Rewards": "reward/",
     "Style of each behaviour": "style/",
@@ -55,45 +46,6 @@ SMOOTHING = 0.9
 class Config:
     run: Annotated[Path, tyro.conf.Positional]
     """Run folder."""
-
-
-class Markup(str):
-    """Text that is HTML already; everything else in a table is escaped."""
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """An HTML table."""
-
-    def line(tag: str, cells: Sequence[Any]) -> str:
-        inner = (cell if isinstance(cell, Markup) else escape(str(cell)) for cell in cells)
-        return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in inner) + "</tr>"
-
-    body = "\n".join(line("td", row) for row in rows)
-    return f'<div class="scroll"><table>{line("th", header)}\n{body}</table></div>'
-
-
-def image(png: bytes, caption: str) -> str:
-    """A picture inside the page."""
-    text = escape(caption)
-    code = base64.b64encode(png).decode()
-    return f'<figure><img alt="{text}" src="data:image/png;base64,{code}"><figcaption>{text}</figcaption></figure>'
-
-
-def drawn(figure: Figure, caption: str) -> str:
-    """A matplotlib figure inside the page."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return image(buffer.getvalue(), caption)
-
-
-def note(text: str) -> str:
-    """A remark on what is missing."""
-    return f'<p class="note">{escape(text)}</p>'
-
-
-def interval(value: Mapping[str, Any] | None) -> str:
-    """An estimate with its interval."""
-    return show(None if value is None else [value["estimate"], value["low"], value["high"]])
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
@@ -161,11 +113,6 @@ def results(found: Mapping[str, Any], figures: Path) -> str:
     return "\n".join(parts)
 
 
-def picture(path: Path, caption: str) -> str:
-    """A PNG of the run inside the page."""
-    return image(path.read_bytes(), caption) if path.is_file() else note(f"no picture {path.name}")
-
-
 def tracking_scatter(episodes: Mapping[str, Any]) -> Figure:
     """Commanded against measured, one point an episode, one panel a quantity."""
     skill = torch.tensor(episodes["skill"])
@@ -218,16 +165,21 @@ def page(run: Path) -> str:
         FileNotFoundError: if the folder is no run.
     """
     record, found = read_json(run / cli.CONFIG_FILE), read_json(run / "evaluation.json")
+    courses = {folder: read_json(folder / "course_evaluation.json") for folder in (run, run / COURSE)}
     manifest = read_json(run / "policy" / "manifest.json") or {}
-    if record is None and found is None:
-        raise FileNotFoundError(
-            f"{run}: expected a run folder with {cli.CONFIG_FILE} or evaluation.json; check the path"
-        )
+    if record is None and found is None and not any(courses.values()):
+        files = f"{cli.CONFIG_FILE}, evaluation.json or course_evaluation.json"
+        raise FileNotFoundError(f"{run}: expected a run folder with {files}; check the path")
     record = record or {}
     parts = [f"<h1>{escape(run.resolve().name)}</h1>"]
     origin = [record.get("recipe"), record.get("started"), " ".join(record.get("command", []))]
     parts.append(note(" · ".join(str(entry) for entry in origin if entry)))
-    parts.append(results(found, run / "figures") if found else note("not evaluated yet: run recipes/evaluate.py on it"))
+    if found:
+        parts.append(results(found, run / "figures"))
+    parts += [course_results(course, folder / "figures") for folder, course in courses.items() if course]
+    if record and not found and not courses[run]:
+        recipe = "evaluate" if record.get("recipe", "bbc_pretrain").startswith("bbc") else "evaluate_course"
+        parts.append(note(f"not evaluated yet: run recipes/{recipe}.py on it"))
     strips = sorted((run / "figures").glob("play_*.png"))
     if strips:
         parts += ["<h2>Pictures</h2>", *(picture(strip, strip.stem.removeprefix("play_")) for strip in strips)]
@@ -240,9 +192,7 @@ def page(run: Path) -> str:
         if value:
             text = escape(json.dumps(value, indent=2))
             parts.append(f"<details><summary>{title}</summary><pre>{text}</pre></details>")
-    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(run.name)}</title>'
-    body = "\n".join(parts)
-    return f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head><body>\n{body}\n</body></html>\n'
+    return document(run.name, parts)
 
 
 def main(config: Config) -> Path:
