@@ -80,11 +80,13 @@ class Demonstrations:
 
     def __init__(self, clips: Sequence[MotionClip], privileged: Tensor, generator: torch.Generator) -> None:
         self.generator, device = generator, generator.device
-        self.data = torch.cat([demonstration(clip, privileged, generator) for clip in clips]).to(device)
-        skill = self.data[keys.COMMAND][:, -NUM_BEHAVIOURS:].argmax(-1)
+        shown = [demonstration(clip, privileged, generator) for clip in clips]
+        self.data: TensorDict = TensorDict.cat(shown).to(device)
+        command = self.data[keys.COMMAND]
+        skill = command[:, -NUM_BEHAVIOURS:].argmax(-1)
         self.weight = 1.0 / skill.bincount(minlength=NUM_BEHAVIOURS)[skill]
         spread = [torch.full((entry.size,), STATE_NOISE[entry.name]) for entry in features.PROPRIOCEPTION_LAYOUT]
-        rest = torch.zeros(self.data[keys.COMMAND].shape[-1] - len(COMMAND_NOISE))
+        rest = torch.zeros(command.shape[-1] - len(COMMAND_NOISE))
         noises = {
             keys.PROPRIOCEPTION: torch.cat(spread),
             keys.ESTIMATE: torch.tensor(ESTIMATE_NOISE),

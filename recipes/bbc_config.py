@@ -200,7 +200,7 @@ class Config(HardwareConfig):
     adaptation: AdaptationConfig = field(default_factory=AdaptationConfig)
 
 
-CHANGEABLE = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight")
+CHANGEABLE: tuple[str, ...] = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight")
 CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
 """Options that may change during a run."""
 

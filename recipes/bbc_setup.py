@@ -78,8 +78,8 @@ class Components:
     @property
     def alike(self) -> dict[str, Any]:
         """What every process holds alike."""
-        names = ("bbc", "critic", "discriminator", "predictor", "prior")
-        names += ("policy_optimizer", "imitation_optimizer", "adaptation_optimizer")
+        names = ["bbc", "critic", "discriminator", "predictor", "prior"]
+        names += ["policy_optimizer", "imitation_optimizer", "adaptation_optimizer"]
         return {name: getattr(self, name) for name in names}
 
     @property

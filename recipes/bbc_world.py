@@ -57,7 +57,7 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
 def rewards(cfg: EnvConfig) -> dict[str, RewardTerm]:
     """The terms of supplement S4, weighted as the options say, with those of ours that have a weight."""
     terms = dict(LOCOMOTION_REWARDS)
-    jump = {"peak": partial(jump_height_peak, width=cfg.jump_width), "window": jump_height_window}[cfg.jump_reward]
+    jump = jump_height_window if cfg.jump_reward == "window" else partial(jump_height_peak, width=cfg.jump_width)
     terms["jump_height"] = RewardTerm(cfg.jump_weight, jump)
     if cfg.progress_weight:
         terms["velocity_progress"] = RewardTerm(cfg.progress_weight, velocity_progress)
