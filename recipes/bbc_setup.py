@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from bbc_cloning import Demonstrations
 from bbc_config import Config
-from bbc_world import load_motion, make_env
+from bbc_world import load_dataset, make_env
 from hardware import training_device
 from held_fixed import INFERRED, privileged_loss
 from tensordict import TensorDictBase
@@ -92,7 +92,7 @@ def build(cfg: Config) -> Components:
     """Construct data, environment, networks, losses and optimisers."""
     device, im, ppo = training_device(cfg), cfg.imitation, cfg.ppo
     seeds = seed_everything(cfg.seed, device)
-    dataset = load_motion(cfg.motion, cfg.seed).to(device)
+    dataset = load_dataset(cfg.motion, cfg.seed).to(device)
     env = make_env(cfg, dataset, seeds)
     bbc = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std).to(device)
     anchor = None

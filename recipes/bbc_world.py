@@ -91,7 +91,7 @@ def make_terrain(cfg: EnvConfig, generator: torch.Generator) -> HeightField | No
     return rough_pyramids(generator, noise=cfg.roughness, slope=cfg.steepness)
 
 
-def load_motion(cfg: MotionConfig, seed: int) -> MotionDataset:
+def load_dataset(cfg: MotionConfig, seed: int) -> MotionDataset:
     """The clips of the given folders, or the synthetic gaits when there are none."""
     if (cfg.labelled is None) != (cfg.unlabelled is None):
         raise ValueError("give both --motion.labelled and --motion.unlabelled, or neither for synthetic gaits")

@@ -16,7 +16,7 @@ Module = Callable[[str], ModuleType]
 
 def test_a_share_of_the_starts_stands(module: Module) -> None:
     world, smoke = module("bbc_world"), module("bbc_presets").SMOKE
-    dataset = world.load_motion(smoke.motion, 0)
+    dataset = world.load_dataset(smoke.motion, 0)
     shares = {}
     for share in (0.0, 0.25, 1.0):
         cfg = replace(smoke, env=replace(smoke.env, standing_starts=share))
