@@ -181,6 +181,7 @@ def make_env(
         command_noise=robots.command_noise,
         randomization=COURSE_RANDOMIZATION if robots.randomize else None,
         episode_length=robots.episode_length,
+        goal_radius=robots.goal_radius,
         start_spread=robots.start_spread,
         push_interval=robots.push_interval,
         **options,

@@ -112,7 +112,6 @@ def build(cfg: Config, trained: Trained) -> Components:
         cfg.env.course,
         trained.decision_steps,
         simulator_options(cfg, cfg.env.num_threads),
-        goal_radius=cfg.env.goal_radius,
         depth=asdict(cfg.camera),
         seed=seeds.integer("environment"),
     )
