@@ -73,6 +73,13 @@ def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
     assert "success/box_jump" in scalars and "success/tunnel" not in scalars
 
 
+def test_options_of_the_course_reach_it(recipe: ModuleType, smoke: Any) -> None:
+    env = replace(smoke.env, goal_radius=0.45, start_spread=2.0)
+    parts = recipe.build(replace(smoke, env=env))
+    assert parts.env.arena.progress.radius == 0.45 and parts.env.arena.start_spread == 2.0
+    parts.env.close()
+
+
 def test_the_curriculum_by_hand(module: Module) -> None:
     grown, config = module("tsc_curriculum"), module("tsc_config")
     cfg = config.CurriculumConfig(success=0.8, episodes=10, difficulty_step=0.5, practice=2.0)
