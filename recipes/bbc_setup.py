@@ -192,6 +192,7 @@ def build(cfg: Config) -> Components:
             divergence=divergence,
             schedule=schedule,
             precision=hidden_precision(ppo.precision, device),
+            compile=ppo.compile,
         ),
         discriminator_loss=DiscriminatorLoss(
             discriminator, criterion=im.criterion, gradient_penalty=im.gradient_penalty

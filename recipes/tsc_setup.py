@@ -157,6 +157,7 @@ def build(cfg: Config) -> Components:
             divergence=divergence,
             schedule=schedule,
             precision=hidden_precision(ppo.precision, device),
+            compile=ppo.compile,
         ),
         bbc=controller,
     )

@@ -67,6 +67,20 @@ def test_an_extra_loss_is_added() -> None:
     assert bool((actor.network.std < before).all())
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # torch's compiler, of torch itself
+def test_a_compiled_update_is_the_eager_one_but_for_rounding() -> None:
+    trained = []
+    for compiled in (False, True):
+        actor, critic, update = build(compile=compiled)
+        batch = collect(actor, critic, torch.Generator().manual_seed(1))
+        for _ in range(3):
+            metrics = update(batch.clone(), torch.Generator().manual_seed(2))
+        trained.append([*actor.parameters(), *critic.parameters(), metrics["loss_objective"]])
+    for eager, compiled in zip(*trained, strict=True):
+        torch.testing.assert_close(compiled, eager, atol=1e-5, rtol=1e-4)
+
+
 def test_too_few_samples_are_refused() -> None:
     actor, critic, update = build(minibatches=1000)
     with pytest.raises(ValueError, match="at least 1000 samples"):
