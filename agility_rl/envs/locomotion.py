@@ -154,7 +154,7 @@ class LocomotionEnv(EnvBase):
             command: ``[N, 5]`` in the order and units of :data:`agility_rl.behaviours.COMMANDS`.
             shift: ``[N, 1]`` in [-1, 1], zero if not given.
         """
-        shift = torch.zeros(self.num_robots, 1) if shift is None else shift
+        shift = torch.zeros(self.num_robots, 1, device=self.device) if shift is None else shift
         self.commands.assign(self._everyone(), *(given.to(self.device) for given in (skill, command, shift)))
 
     def set_skill_probabilities(self, probabilities: Tensor) -> None:
