@@ -24,7 +24,7 @@ def course_results(found: Mapping[str, Any], figures: Path) -> str:
     settings, kind = found["settings"], found["kind"]
     where = "by depth images alone" if kind == "student" else "by scandots" if kind == "teacher" else "by a script"
     parts = [
-        f"<h2>On courses: {escape(kind)} {escape(str(found['run']))}</h2>",
+        f"<h2>On courses: {escape(' '.join(dict.fromkeys((kind, str(found['run'])))))}</h2>",
         note(
             f"{settings['episodes']} episodes of each course, of {settings['episode_length']:g} s at most, decided "
             f"{where}. Time and speeds are of successful episodes, collisions of all. Intervals are of 95 %."
