@@ -33,6 +33,7 @@ from agility_rl import keys, rotations
 from agility_rl.behaviours import BEHAVIOURS, NUM_BEHAVIOURS, command_bounds
 from agility_rl.envs import COURSES, LocomotionEnv
 from agility_rl.envs.layout import CourseLayout
+from agility_rl.envs.robots import CLEARANCE
 from agility_rl.go2 import constants, features
 from agility_rl.go2.model import build_spec
 from agility_rl.simulation import Simulator, make_simulator, rough_pyramids, simulator_device
@@ -144,7 +145,7 @@ def bare_step(engine: str, args: argparse.Namespace) -> Callable[[Tensor], None]
     """The engine alone: write the targets, step."""
     model = build_spec(sim_dt=constants.SIM_DT).compile()
     substeps = round(constants.CONTROL_DT / constants.SIM_DT)
-    start = [*model.qpos0[:2], constants.STANDING_HEIGHT + 0.005, *model.qpos0[3:7], *constants.DEFAULT_POSE]
+    start = [*model.qpos0[:2], constants.STANDING_HEIGHT + CLEARANCE, *model.qpos0[3:7], *constants.DEFAULT_POSE]
     if engine == "batch":
         batch = mujoco.batch.Batch(model, args.robots, args.threads)
         batch.bind("qpos")[:] = start

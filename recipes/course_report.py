@@ -44,10 +44,7 @@ def course_results(found: Mapping[str, Any], figures: Path) -> str:
     for name in courses:
         file = Path(name.split(", ")[0]).stem
         if ", " not in name:  # disturbed images go other ways, but the picture would say the same
-            parts.append(
-                picture(
-                    figures / f"course_{file}.png", f"{name}: a typical success, and the failure that came farthest"
-                )
-            )
+            caption = f"{name}: of the successes one of median time, of the failures the one that came farthest"
+            parts.append(picture(figures / f"course_{file}.png", caption))
     parts.append(picture(figures / "course_behaviours.png", "behaviours before each obstacle, shares of time"))
     return "\n".join(parts)

@@ -47,7 +47,8 @@ from agility_rl.training import cli
 
 SAME_ANSWER = 1e-5
 """Largest difference of an output between the training policy and the deployed network, and between that by PyTorch and
-by onnxruntime: float32 sums of a batch and of one row, or of two libraries, are rounded differently."""
+by onnxruntime, as a share of the output where that is above one: float32 sums of a batch and of one row, or of two
+libraries, are rounded differently, and a logit of 20 is rounded more coarsely than a probability."""
 _WRITTEN_ANEW = ("format", "format_version", "weights", "onnx", CHECKSUM, "limits", "normalisers")
 
 
@@ -180,8 +181,9 @@ def to_onnx(export: Exportable, metadata: dict[str, Any]) -> bytes:
 
 
 def difference(ours: Sequence[Tensor], theirs: Sequence[Tensor]) -> float:
-    """Largest absolute difference; NaN counts as infinite."""
-    return max(float((a - b).abs().nan_to_num(torch.inf).max()) for a, b in zip(ours, theirs, strict=True))
+    """Largest ``|a - b| / max(1, |b|)``; NaN counts as infinite."""
+    shares = [(a - b).abs() / b.abs().clamp(min=1.0) for a, b in zip(ours, theirs, strict=True)]
+    return max(float(share.nan_to_num(torch.inf).max()) for share in shares)
 
 
 @torch.no_grad()

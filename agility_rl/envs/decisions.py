@@ -10,6 +10,7 @@ from torch import Tensor
 
 from agility_rl import behaviours
 from agility_rl.envs.commands import CommandSampler
+from agility_rl.envs.randomization import uniform
 
 NUM_PARAMETERS = len(behaviours.COMMANDS) + 1
 COMMAND_NOISE = (0.8, 1.2)
@@ -62,10 +63,8 @@ class Decisions:
         """Take a decision of every robot, int64 ``[N]`` and ``[N, 5, 6]``."""
         chosen = parameters.take_along_dim(behaviour[:, None, None], 1)[:, 0].clamp(-1.0, 1.0)
         command, shift = behaviours.commands_from_parameters(behaviour, chosen)
-        low, high = self.noise
-        if low != high:
-            factor = torch.rand(command.shape, generator=self.generator, device=command.device)
-            command = command * (low + (high - low) * factor)
+        if self.noise[0] != self.noise[1]:
+            command = command * uniform(command.shape, self.noise, self.generator)
         self.commands.assign(torch.ones_like(self.fresh), behaviour, command, shift)
         news = {"behaviours": behaviour, "parameters": parameters, "applied": chosen}
         for name, new in news.items():

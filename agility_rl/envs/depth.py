@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from agility_rl.envs.randomization import uniform
 from agility_rl.go2 import camera
 from agility_rl.simulation import Simulator
 
@@ -24,8 +25,8 @@ class DepthObservation:
     each episode, and latency counts control steps, so that it stays the camera's own at any rate of decisions.
 
     Args:
-        simulator: where the robots live.
-        generator: source of randomness; where it is, the tensors are.
+        simulator: where the robots live; the tensors are on its device.
+        generator: source of randomness, on the simulator's device.
         decision_steps: control steps between two observations.
         frame_steps: control steps between two frames of the camera; 1 is 50 Hz.
         latency: fewest and most control steps by which an image is late; (1, 1) as released.
@@ -77,7 +78,7 @@ class DepthObservation:
         """Start episodes of the rows of a bool mask ``[N]``, which the simulator has just put somewhere."""
         n, device = len(mask), mask.device
         late = torch.randint(self.latency[0], self.latency[1] + 1, (n,), generator=self.generator, device=device)
-        pitch = self.pitch * (2.0 * torch.rand(n, generator=self.generator, device=device) - 1.0)
+        pitch = self.pitch * uniform((n,), (-1.0, 1.0), self.generator)
         self._late = torch.where(mask, late, self._late)
         self._step = self._step.masked_fill(mask, 0)
         self.camera.set_pitch(mask, pitch)
@@ -110,9 +111,9 @@ class DepthObservation:
         if self.offset_noise or self.pixel_noise:
             # Drawn for every robot, whoever's frame is due, so that one robot's noise does not depend on the others.
             n = len(mask)
-            offset, scale = torch.rand(2, n, 1, 1, generator=self.generator, device=mask.device)
-            pixel = torch.rand(n, *depth.shape[1:], generator=self.generator, device=mask.device)
-            noise = self.offset_noise * (2.0 * offset - 1.0) + self.pixel_noise * scale * (2.0 * pixel - 1.0)
+            offset, scale = uniform((2, n, 1, 1), (0.0, 1.0), self.generator)
+            pixel = uniform((n, *depth.shape[1:]), (-1.0, 1.0), self.generator)
+            noise = self.offset_noise * (2.0 * offset - 1.0) + self.pixel_noise * scale * pixel
             depth = depth + noise[mask]
         return camera.normalize_depth(depth)
 

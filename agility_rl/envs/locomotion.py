@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.observations import ObservationGroups
-from agility_rl.envs.randomization import Randomization
+from agility_rl.envs.randomization import Randomization, uniform
 from agility_rl.envs.reference import PAST, ReferenceStates
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm
 from agility_rl.envs.robots import CLEARANCE, Pushes, Robots
@@ -217,12 +217,11 @@ class LocomotionEnv(EnvBase):
 
     # -- physics -----------------------------------------------------------------------------------------------------
     def _place(self, mask: Tensor) -> Tensor | None:
-        n, device = self.num_robots, self.device
+        n = self.num_robots
         start = self.reference.sample(self.commands.skill, self.generator)
-        yaw = 2.0 * torch.pi * torch.rand(n, generator=self.generator, device=device)
+        yaw = uniform((n,), (0.0, 2.0 * torch.pi), self.generator)
         turn = rotations.from_euler(torch.zeros_like(yaw), torch.zeros_like(yaw), yaw)
-        place = torch.rand(n, 2, generator=self.generator, device=device)
-        place = self.simulator.ground_extent * (2.0 * place - 1.0)
+        place = self.simulator.ground_extent * uniform((n, 2), (-1.0, 1.0), self.generator)
         height = self.simulator.ground_height(place)[:, None] + start["root_height"] + CLEARANCE
         self.simulator.reset(
             mask,

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from agility_rl import keys
 from agility_rl.envs.commands import CommandSampler
+from agility_rl.envs.randomization import uniform
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import features
 
@@ -97,8 +98,7 @@ class ObservationGroups:
             touched,
         )
         if self.noise is not None:
-            uniform = torch.rand(measured.shape, generator=self.generator, device=measured.device)
-            measured = measured + self.noise * (2.0 * uniform - 1.0)
+            measured = measured + self.noise * uniform(measured.shape, (-1.0, 1.0), self.generator)
         return measured.clamp(-features.OBSERVATION_LIMIT, features.OBSERVATION_LIMIT)
 
     def state_dict(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from agility_rl import rotations
 from agility_rl.envs.commands import CommandSampler
-from agility_rl.envs.randomization import NOMINAL, Randomization, sample_parameters
+from agility_rl.envs.randomization import NOMINAL, Randomization, sample_parameters, uniform
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator
@@ -186,5 +186,4 @@ class Pushes:
             return
         mask = (step_count + self.phase) % self.interval == self.interval - 1
         if bool(mask.any()):
-            uniform = torch.rand(len(mask), 2, generator=self.generator, device=mask.device)
-            simulator.push(mask, self.velocity * (2.0 * uniform - 1.0))
+            simulator.push(mask, self.velocity * uniform((len(mask), 2), (-1.0, 1.0), self.generator))

@@ -8,6 +8,8 @@ published with "Learning Diverse Natural Behaviors for Enhancing the Agility of 
 
 from __future__ import annotations
 
+import functools
+
 LEGS = ("FL", "FR", "RL", "RR")
 """Front left, front right, rear left, rear right: the order of legs, joints and feet."""
 
@@ -128,6 +130,7 @@ TRUNK_MASS = 6.921
 """Mass of the trunk with the head [kg]. [M]"""
 
 
+@functools.cache
 def soft_joint_limits() -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Lower and upper joint positions [rad], of 12 joints each, at :data:`SOFT_LIMIT_FACTOR` of the range."""
     shrink = (1.0 - SOFT_LIMIT_FACTOR) / 2.0

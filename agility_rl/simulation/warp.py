@@ -127,9 +127,8 @@ class WarpSimulator:
             return None
         kept = [array.clone() for array in (self._qpos, self._qvel, self._warmstart)]
         torch.cuda.synchronize(self.device)
-        with wp.ScopedDevice(
-            wp.device_from_torch(self.device)
-        ):  # on Warp's stream: torch's default one is not captured
+        # On Warp's stream: torch's default one is not captured.
+        with wp.ScopedDevice(wp.device_from_torch(self.device)):
             mjw.step(self._model, self._data)  # compiles what a capture could not
             with wp.ScopedCapture() as capture:
                 mjw.step(self._model, self._data)

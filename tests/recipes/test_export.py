@@ -88,6 +88,13 @@ def test_a_network_that_is_not_the_trained_policy_is_refused(export: ModuleType,
         export.check_network(replace(exportable, network=network))
 
 
+def test_differences_count_as_shares_of_large_outputs(export: ModuleType) -> None:
+    ours, theirs = torch.tensor([0.5, 20.0]), torch.tensor([0.5, 20.4])
+    assert export.difference([ours], [theirs]) == pytest.approx(0.4 / 20.4)
+    assert export.difference([ours], [ours - 0.25]) == 0.25
+    assert export.difference([ours * float("nan")], [theirs]) == float("inf")
+
+
 def test_a_student_is_exported_with_its_memory(
     export: ModuleType, untrained: Path, make_student: Callable[..., Path], tmp_path: Path
 ) -> None:
