@@ -15,12 +15,15 @@ Out: ``runs/NAME/`` with ``config.json`` and ``policy/``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
+import bbc_config
 import torch
+from bbc_world import make_env
+from mirroring import Side, mirrored
 from rollouts import Controller, MotionConfig, load_controller, load_motion
 from steering import steered
 from tensordict import TensorDictBase
@@ -35,6 +38,7 @@ from agility_rl.envs import LocomotionEnv
 from agility_rl.go2 import constants, features
 from agility_rl.losses import AdaptationLoss, StateEstimationLoss
 from agility_rl.modules import BasicBehaviourController
+from agility_rl.motion import MotionDataset
 from agility_rl.training import cli
 from agility_rl.training.seeding import seed_everything
 
@@ -43,6 +47,14 @@ Experience = tuple[TensorDictBase, TensorDictBase]
 LABEL = "label"
 """Mean action of a row's teacher, float32 ``[B, 12]``."""
 INPUTS = (keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.HISTORY, keys.COMMAND, keys.PEAK, keys.SKILL)
+
+ENVIRONMENT = bbc_config.EnvConfig(
+    num_robots=512,
+    randomize=False,
+    push_interval=None,
+    observation_noise=0.0,
+    episode_length=8.0,  # as in the preset ``cpu`` of ``bbc_pretrain.py``
+)
 
 
 @dataclass(frozen=True)
@@ -56,7 +68,10 @@ class Config:
     and its weights are where the student starts."""
     steered: tuple[str, ...] = ()
     """Behaviours whose teacher only goes straight ahead: it is led along the commanded curves (``steering.py``)."""
-    num_robots: int = 512
+    mirrored: tuple[tuple[str, Side], ...] = ()
+    """Behaviour and the side to which its teacher turns well: to the other it acts in a mirror (``mirroring.py``)."""
+    env: bbc_config.EnvConfig = field(default_factory=lambda: ENVIRONMENT)
+    """Where they walk. The joints' dry friction is that of the teachers' simulator."""
     rounds: int = 24
     teacher_rounds: int = 2
     """First rounds in which the teachers act."""
@@ -70,15 +85,20 @@ class Config:
     learning_rate: float = 1e-3
     noise: float = 0.2
     """Standard deviation of what is added to the actions that are taken, in action units; labels are without."""
-    episode_length: float = 8.0
-    """Seconds; as in the preset ``cpu`` of ``bbc_pretrain.py``."""
-    num_threads: int | None = None
     motion: MotionConfig = field(default_factory=MotionConfig)
 
 
 PRESETS = {
     "cpu": Config(),
-    "smoke": Config(name="smoke", num_robots=20, rounds=3, teacher_rounds=1, steps=20, updates=5, batch_size=128),
+    "smoke": Config(
+        name="smoke",
+        env=replace(ENVIRONMENT, num_robots=20),
+        rounds=3,
+        teacher_rounds=1,
+        steps=20,
+        updates=5,
+        batch_size=128,
+    ),
 }
 
 
@@ -86,10 +106,15 @@ def load_teachers(cfg: Config) -> list[Controller]:
     """The teacher of every behaviour, in the order of the behaviours.
 
     Raises:
-        ValueError: if a behaviour is missing, named twice, or none of the five, here or in ``--steered``.
+        ValueError: if a behaviour is missing, named twice, or none of the five, here, in ``--steered`` or in
+            ``--mirrored``.
     """
-    if unknown := sorted(set(cfg.steered) - set(BEHAVIOURS)):
-        raise ValueError(f"--steered: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
+    sides = [name for name, _ in cfg.mirrored]
+    for option, chosen in (("steered", cfg.steered), ("mirrored", sides)):
+        if unknown := sorted(set(chosen) - set(BEHAVIOURS)):
+            raise ValueError(f"--{option}: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
+    if len(set(sides)) < len(sides):
+        raise ValueError(f"--mirrored: expected every behaviour once at most, got {', '.join(sides)}")
     names = [name for name, _ in cfg.teachers]
     if sorted(names) != sorted(BEHAVIOURS):
         raise ValueError(
@@ -102,13 +127,24 @@ def load_teachers(cfg: Config) -> list[Controller]:
     return [loaded[dict(cfg.teachers)[name]] for name in BEHAVIOURS]
 
 
-def labeller(teachers: list[Controller], lead: Collection[str]) -> Act:
-    """A function that gives the mean action ``[B, 12]`` of the teacher of each row's behaviour, some of them led."""
-    kinds = [(id(teacher.bbc), name in lead) for name, teacher in zip(BEHAVIOURS, teachers, strict=True)]
-    acts = {
-        kind: steered(partial(mean_action, teacher.bbc)) if kind[1] else partial(mean_action, teacher.bbc)
-        for kind, teacher in zip(kinds, teachers, strict=True)
-    }
+def labeller(teachers: list[Controller], lead: Collection[str] = (), sides: Mapping[str, Side] | None = None) -> Act:
+    """A function that gives the mean action ``[B, 12]`` of the teacher of each row's behaviour.
+
+    Args:
+        teachers: in the order of the behaviours.
+        lead: behaviours that are led along curves.
+        sides: behaviours that act in a mirror where the other side is commanded.
+    """
+    sides = sides or {}
+    kinds = [
+        (id(teacher.bbc), name in lead, sides.get(name)) for name, teacher in zip(BEHAVIOURS, teachers, strict=True)
+    ]
+    acts: dict[tuple[int, bool, Side | None], Act] = {}
+    for kind, teacher in zip(kinds, teachers, strict=True):
+        act: Act = partial(mean_action, teacher.bbc)
+        if kind[1]:
+            act = steered(act)
+        acts[kind] = act if kind[2] is None else mirrored(act, kind[2])
     index = torch.tensor([list(acts).index(kind) for kind in kinds])
 
     @torch.no_grad()
@@ -175,18 +211,13 @@ def main(cfg: Config) -> Path:
     bbc = first.bbc
     motion = load_motion(cfg.motion, first.trained, cfg.seed)
     folder = cli.start_run(cfg, cfg.runs / cfg.name, recipe="bbc_distill")
-    env = LocomotionEnv(
-        cfg.num_robots,
-        simulator_options={"num_threads": cfg.num_threads, "friction_loss": first.friction_loss},
-        reference=motion.start_states(cfg.seed),
-        episode_length=cfg.episode_length,
-        seed=seeds.integer("environment"),
-    )
-    label, carrier = labeller(teachers, cfg.steered), env.reset()
+    world = bbc_config.Config(env=replace(cfg.env, friction_loss=first.friction_loss))
+    env = make_env(world, MotionDataset(motion.labelled, motion.labelled), seeds)
+    label, carrier = labeller(teachers, cfg.steered, dict(cfg.mirrored)), env.reset()
     optimizer = torch.optim.Adam(bbc.parameters(), lr=cfg.learning_rate)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, cfg.rounds)
     replay = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(cfg.memory * cfg.steps * cfg.num_robots), batch_size=cfg.batch_size
+        storage=LazyTensorStorage(cfg.memory * cfg.steps * cfg.env.num_robots), batch_size=cfg.batch_size
     )
     for number in range(cfg.rounds):
         act = label if number < cfg.teacher_rounds else partial(mean_action, bbc)

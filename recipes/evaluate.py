@@ -54,6 +54,9 @@ LEAP = round(0.9 / DT)
 TOLERANCE, PHASE_TOLERANCE = 0.25, 0.05
 """Allowed distance from the dog's clips: a quarter, but for phases (shares of a stride, often near 0) at least 0.05."""
 
+TURNING = 0.2
+"""Slower commanded turns [rad/s] say nothing about how well a robot turns."""
+
 
 @dataclass(frozen=True)
 class Config:
@@ -183,13 +186,16 @@ def evaluate_behaviours(
         walked = rows & upright
         # Standing is right where the command is to stand: the dead-band of walk makes a few commands of no velocity.
         right = rows & ((shown == index) | ((shown == STAND) & (command[:, :3] == 0).all(-1)))
-        entry: dict[str, Any] = {"episodes": config.episodes, "errors": {}, "gait": {}}
+        entry: dict[str, Any] = {"episodes": config.episodes, "errors": {}, "turns": {}, "gait": {}}
         entry["shown"] = dict(zip(COLUMNS, shown[rows].bincount(minlength=len(COLUMNS)).tolist(), strict=True))
         entry["recognised"] = metrics.wilson_interval(int(right.sum()), config.episodes)
         entry["falls"] = metrics.wilson_interval(int((rows & ~upright).sum()), config.episodes)
         if walked.any():
             for column, key in enumerate(names):
                 entry["errors"][key] = metrics.mean_interval((got[column] - wanted[:, column])[walked].abs())
+            for side, turn in (("left", wanted[:, 2]), ("right", -wanted[:, 2])):
+                if (turned := walked & (turn > TURNING)).any():
+                    entry["turns"][side] = metrics.mean_interval((got[2] / wanted[:, 2])[turned])
             for key, dog in dog_figures(motion.labelled, name).items():
                 slack = PHASE_TOLERANCE if key.startswith("phase") else 0.0
                 entry["gait"][key] = compare(metrics.mean_interval(gait[key][walked]), dog, slack)

@@ -97,6 +97,10 @@ def print_evaluation(found: Mapping[str, Any], console: Console) -> None:
         errors = [show(entry["errors"].get(key)) for key in found["episodes"]["quantities"]]
         table.add_row(name, *errors, show(entry["falls"]))
     console.print(table)
+    table = make_table("turn rates as shares of the commanded ones", "commanded", "to the left", "to the right")
+    for name, entry in found["behaviours"].items():
+        table.add_row(name, *(show(entry["turns"].get(side)) for side in ("left", "right")))
+    console.print(table)
     if found["switches"]:
         trials = found["switches"]["trials"]
         table = make_table(

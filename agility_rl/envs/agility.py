@@ -167,7 +167,7 @@ class AgilityEnv(EnvBase):
             {
                 keys.PROPRIOCEPTION: group(features.NUM_PROPRIOCEPTION),
                 keys.EXPLICIT: group(features.NUM_EXPLICIT),
-                keys.PRIVILEGED: group(29),
+                keys.PRIVILEGED: group(features.NUM_PRIVILEGED),
                 keys.HISTORY: group(features.HISTORY, features.NUM_PROPRIOCEPTION),
                 keys.COMMAND: group(len(behaviours.COMMANDS) + 1 + behaviours.NUM_BEHAVIOURS),
                 keys.PEAK: group(1),

@@ -54,8 +54,8 @@ def sample_parameters(
     """Draw simulator parameters and the privileged observation that describes them.
 
     Returns:
-        ``(fields, privileged)``: fields for ``Simulator.set_parameters`` and float32 ``[N, 29]`` (added mass [kg],
-        centre of mass 3 [m], friction, stiffness multipliers - 1 (12), damping multipliers - 1 (12)).
+        ``(fields, privileged)``: fields for ``Simulator.set_parameters`` and float32 ``[N, 29]``, laid out as
+        :data:`agility_rl.go2.features.PRIVILEGED_LAYOUT`.
 
     Example:
         >>> fields, privileged = sample_parameters(2, NOMINAL, torch.Generator())

@@ -71,6 +71,15 @@ MOTION_LAYOUT: tuple[Entry, ...] = (
 )
 """49 numbers of one discriminator frame."""
 
+PRIVILEGED_LAYOUT: tuple[Entry, ...] = (
+    Entry("trunk_mass", 1, "kg, added"),
+    Entry("trunk_com", 3, "m, offset"),
+    Entry("ground_friction", 1, "1"),
+    Entry("stiffness", 12, "share above the nominal one"),
+    Entry("damping", 12, "share above the nominal one"),
+)
+"""29 numbers of the simulation that no robot measures."""
+
 MEASUREMENT_LAYOUT: tuple[Entry, ...] = (
     Entry("roll_pitch", 2, "rad", 1.0, 0.01),
     Entry("angular_velocity", 3, "rad/s, base frame", 1.0, 0.2),
@@ -88,6 +97,7 @@ CONTROLLER_LAYOUTS: dict[str, tuple[Entry, ...]] = {
 NUM_PROPRIOCEPTION = sum(entry.size for entry in PROPRIOCEPTION_LAYOUT)
 NUM_EXPLICIT = sum(entry.size for entry in EXPLICIT_LAYOUT)
 NUM_MOTION = sum(entry.size for entry in MOTION_LAYOUT)
+NUM_PRIVILEGED = sum(entry.size for entry in PRIVILEGED_LAYOUT)
 NUM_MEASUREMENT = sum(entry.size for entry in MEASUREMENT_LAYOUT)
 
 

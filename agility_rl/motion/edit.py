@@ -14,6 +14,7 @@ from torch import Tensor
 from agility_rl import rotations
 from agility_rl.bending import bend_points
 from agility_rl.go2 import constants, kinematics
+from agility_rl.go2.mirror import AXIAL, OTHER_SIDE, POLAR, mirror_joints
 from agility_rl.motion.clip import (
     CONTROL_DT,
     MotionClip,
@@ -87,9 +88,8 @@ def mirror(clip: MotionClip) -> MotionClip:
 
     A mirror image of a mirror image is the clip itself. The label stays: all five behaviours look alike in a mirror.
     """
-    polar = torch.tensor([1.0, -1.0, 1.0])
-    axial = torch.tensor([-1.0, 1.0, -1.0])
-    swap = [1, 0, 3, 2]
+    polar, axial = torch.tensor(POLAR), torch.tensor(AXIAL)
+    swap = list(OTHER_SIDE)
     return replace(
         clip,
         root_position=clip.root_position * polar,
@@ -102,16 +102,6 @@ def mirror(clip: MotionClip) -> MotionClip:
         foot_contact=clip.foot_contact[:, swap],
         notes=(*clip.notes, "mirrored"),
     )
-
-
-def mirror_joints(joints: Tensor) -> Tensor:
-    """Joint angles or velocities ``[*B, 12]`` of the left-right mirror image: legs exchanged, hips negated.
-
-    Example:
-        >>> mirror_joints(torch.arange(12.0))[:6]
-        tensor([-3.,  4.,  5., -0.,  1.,  2.])
-    """
-    return (joints.unflatten(-1, (4, 3))[..., [1, 0, 3, 2], :] * torch.tensor([-1.0, 1.0, 1.0])).flatten(-2)
 
 
 def bend(clip: MotionClip, curvature: float) -> MotionClip:

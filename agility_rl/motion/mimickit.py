@@ -18,8 +18,9 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor
 
+from agility_rl.go2.mirror import mirror_joints
 from agility_rl.motion.clip import MotionClip, MotionError, clip_from_joints
-from agility_rl.motion.edit import foot_slip, ground, mirror_joints
+from agility_rl.motion.edit import foot_slip, ground
 
 NUM_COLUMNS = 18
 

@@ -16,6 +16,7 @@ from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.go2 import features
+from agility_rl.go2.mirror import mirror_joints
 from agility_rl.modules import BasicBehaviourController
 
 Module = Callable[[str], ModuleType]
@@ -68,7 +69,7 @@ def test_the_student_comes_nearer_to_its_teachers(
 ) -> None:
     distill, (first, second) = module("bbc_distill"), pair
     teachers = tuple((name, second if name == "trot" else first) for name in BEHAVIOURS)
-    cfg = replace(distill.PRESETS["smoke"], runs=tmp_path, teachers=teachers, num_threads=1, updates=40)
+    cfg = replace(distill.PRESETS["smoke"], runs=tmp_path, teachers=teachers, updates=40)
     run = distill.main(cfg)
     lines = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("round")]
     told = [dict(zip(line[2::2], map(float, line[3::2]), strict=True)) for line in lines]
@@ -122,3 +123,20 @@ def test_a_steered_teacher_labels_the_curve(module: Module, pair: tuple[Path, Pa
     assert (led[pacing] - plain[pacing]).abs().amax(-1).min() > 1e-3 and led.isfinite().all()
     with pytest.raises(ValueError, match="--steered: unknown gallop"):
         distill.load_teachers(replace(distill.PRESETS["smoke"], steered=("gallop",)))
+
+
+def test_a_mirrored_teacher_labels_the_other_side_in_a_mirror(module: Module, pair: tuple[Path, Path]) -> None:
+    distill, (first, _) = module("bbc_distill"), pair
+    teachers = distill.load_teachers(
+        replace(distill.PRESETS["smoke"], teachers=tuple((name, first) for name in BEHAVIOURS))
+    )
+    td = observations()
+    plain, both = distill.labeller(teachers)(td), distill.labeller(teachers, sides={"trot": "left"})(td)
+    right = (td[keys.SKILL] == BEHAVIOURS.index("trot")) & (td[keys.COMMAND][:, 2] < 0.0)
+    assert right.any() and torch.allclose(both[~right], plain[~right])
+    expected = mirror_joints(distill.labeller(teachers)(module("mirroring").mirror_observation(td)))
+    torch.testing.assert_close(both[right], expected[right])
+    with pytest.raises(ValueError, match="--mirrored: unknown gallop"):
+        distill.load_teachers(replace(distill.PRESETS["smoke"], mirrored=(("gallop", "left"),)))
+    with pytest.raises(ValueError, match="--mirrored: expected every behaviour once at most, got trot, trot"):
+        distill.load_teachers(replace(distill.PRESETS["smoke"], mirrored=(("trot", "left"), ("trot", "right"))))

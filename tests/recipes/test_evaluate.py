@@ -32,7 +32,16 @@ def test_an_evaluation_writes_numbers_tables_and_pictures(untrained: Path, recip
     assert len(found["switches"]["without_fall"]) == 20
     assert set(found["prior"]["learned"]) == set(BEHAVIOURS)
     assert sum(found["prior"]["unlabelled_among_behaviours"].values()) == pytest.approx(1.0, abs=1e-4)
-    assert len(found["episodes"]["measured"]) == 10
+    rows, fall = found["episodes"], len(found["matrix"]["columns"]) - 1
+    assert len(rows["measured"]) == 10
+    for index, name in enumerate(BEHAVIOURS):
+        numbers = zip(rows["skill"], rows["shown"], rows["commanded"], rows["measured"], strict=True)
+        turns = [(c[2], m[2]) for skill, shown, c, m in numbers if skill == index and shown != fall]
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            shares = [measured / commanded for commanded, measured in turns if sign * commanded > 0.2]
+            told = found["behaviours"][name]["turns"].get(side)
+            assert (told is not None) == bool(shares)
+            assert told is None or told["estimate"] == pytest.approx(sum(shares) / len(shares), abs=1e-5)
     walk = next(row for row in found["targets"] if row["name"] == "walk: recognised")
     assert not walk["passed"], "an untrained controller does not walk"
     pictures = {path.name for path in (untrained / "figures").iterdir()}
