@@ -15,21 +15,11 @@ from torch import Tensor
 
 from agility_rl import keys
 from agility_rl.behaviours import COMMANDS
-from agility_rl.go2.features import PRIVILEGED_LAYOUT, PROPRIOCEPTION_LAYOUT
-from agility_rl.go2.mirror import mirror_commands, mirror_features, mirror_joints
+from agility_rl.envs.mirror import mirror
+from agility_rl.go2.mirror import mirror_joints
 
 Side = Literal["left", "right"]
 TURN = COMMANDS.index("yaw_rate")
-
-
-def mirror_observation(observation: TensorDictBase) -> TensorDictBase:
-    """What the controller's mirror image would observe: of every observation that an action follows from."""
-    observation = observation.copy()
-    layouts = {keys.PROPRIOCEPTION: PROPRIOCEPTION_LAYOUT, keys.PRIVILEGED: PRIVILEGED_LAYOUT}
-    for name, layout in layouts.items():
-        observation[name] = mirror_features(layout, observation[name])
-    observation[keys.COMMAND] = mirror_commands(observation[keys.COMMAND])
-    return observation
 
 
 def mirrored(act: Callable[[TensorDictBase], Tensor], side: Side) -> Callable[[TensorDictBase], Tensor]:
@@ -41,7 +31,8 @@ def mirrored(act: Callable[[TensorDictBase], Tensor], side: Side) -> Callable[[T
 
     def both(observation: TensorDictBase) -> Tensor:
         said = act(observation)
-        image = mirror_joints(act(mirror_observation(observation)))
+        seen = observation.select(keys.PROPRIOCEPTION, keys.PRIVILEGED, keys.COMMAND, keys.PEAK)
+        image = mirror_joints(act(mirror(seen)))
         return torch.where(sign * observation[keys.COMMAND][:, TURN, None] < 0.0, image, said)
 
     return both

@@ -11,6 +11,7 @@ from typing import Literal
 
 from hardware import HardwareConfig
 
+from agility_rl.envs.agility_rewards import TERMINATION
 from agility_rl.training.precision import Precision
 
 
@@ -93,6 +94,9 @@ class RewardConfig:
     published weights 5/6 of what a robot earns that moves on, and falls."""
     reach_goal: float = 5.0
     """Weight of being at a way-point, for the two control steps until the next one counts (section 5.6)."""
+    termination: float = TERMINATION
+    """Weight of a failure, for one control step (section 5.6). What it costs beside is the rest of the course; as
+    published it costs so little that a fifth of the obstacles is given up for speed."""
 
 
 @dataclass(frozen=True)

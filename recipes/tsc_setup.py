@@ -93,6 +93,7 @@ def build(cfg: Config) -> Components:
         seed=seeds.integer("environment"),
         motion_offsets=offsets,
         rewards=rewards(cfg.reward),
+        termination_reward=cfg.reward.termination,
     )
     allowed = None if set(cfg.behaviours) == set(BEHAVIOURS) else sorted(skill_index(name) for name in cfg.behaviours)
     teacher = Teacher(len(OBSTACLES), ppo.hidden, ppo.initial_std, ppo.min_std, allowed).to(device)

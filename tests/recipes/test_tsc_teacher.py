@@ -75,8 +75,10 @@ def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
 
 def test_options_of_the_course_reach_it(recipe: ModuleType, smoke: Any) -> None:
     env = replace(smoke.env, goal_radius=0.45, start_spread=2.0)
-    parts = recipe.build(replace(smoke, env=env))
+    reward = replace(smoke.reward, termination=-500.0, heading=0.25)
+    parts = recipe.build(replace(smoke, env=env, reward=reward))
     assert parts.env.arena.progress.radius == 0.45 and parts.env.arena.start_spread == 2.0
+    assert parts.env.termination_reward == -500.0 and parts.env.rewards["heading"].weight == 0.25
     parts.env.close()
 
 
