@@ -11,7 +11,7 @@ from rollouts import Controller, load_controller
 from tsc_config import Config as TeacherConfig
 
 from agility_rl import behaviours, keys
-from agility_rl.deploy.artifact import Artifact, ArtifactError
+from agility_rl.deploy.artifact import MANIFEST_FILE, Artifact, ArtifactError
 from agility_rl.deploy.task import check_camera
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import constants, features
@@ -115,7 +115,7 @@ def load_bbc_of(trained: Trained, bbc: Path | None) -> Controller:
     Raises:
         ArtifactError: if it is another one.
     """
-    controller = load_controller(bbc or trained_bbc(trained.run))
+    controller = load_controller(bbc or trained_bbc(trained))
     digest, expected = controller.artifact.manifest["weights"]["sha256"], trained.artifact.manifest.get("bbc")
     if expected != digest:
         raise ArtifactError(
@@ -125,12 +125,24 @@ def load_bbc_of(trained: Trained, bbc: Path | None) -> Controller:
     return controller
 
 
-def trained_bbc(run: Path) -> Path:
-    """Where a run's configuration says its controller was, else where that of the teachers is."""
-    file = run / "config.json"
-    if not file.is_file():
-        return TeacherConfig().bbc
-    try:
-        return Path(json.loads(file.read_text(encoding="utf-8"))["config"]["bbc"])
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{file} is damaged or no run's configuration: {error}; give the BBC as --bbc") from error
+def trained_bbc(trained: Trained) -> Path:
+    """Where the controller of its training is: where its run's configuration says, else beside it, else the default's.
+
+    Raises:
+        ValueError: if the configuration is damaged.
+    """
+    file = trained.run / "config.json"
+    if file.is_file():
+        try:
+            return Path(json.loads(file.read_text(encoding="utf-8"))["config"]["bbc"])
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise ValueError(f"{file} is damaged or no run's configuration: {error}; give the BBC as --bbc") from error
+    expected = trained.artifact.manifest.get("bbc")
+    for manifest in sorted(trained.run.resolve().parent.glob(f"*/{MANIFEST_FILE}")):
+        try:
+            found = json.loads(manifest.read_text(encoding="utf-8"))
+            if found["kind"] == "bbc" and found["weights"]["sha256"] == expected:
+                return manifest.parent
+        except (json.JSONDecodeError, KeyError, TypeError):
+            continue  # somebody else's manifest
+    return TeacherConfig().bbc

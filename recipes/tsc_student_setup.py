@@ -95,7 +95,7 @@ def resolve(cfg: Config) -> tuple[Config, Trained]:
                 "put that one back, or begin another run with --init-from"
             )
     course = cfg.env.course or trained.course
-    return replace(cfg, bbc=cfg.bbc or trained_bbc(trained.run), env=replace(cfg.env, course=course)), trained
+    return replace(cfg, bbc=cfg.bbc or trained_bbc(trained), env=replace(cfg.env, course=course)), trained
 
 
 def build(cfg: Config, trained: Trained) -> Components:

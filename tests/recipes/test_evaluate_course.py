@@ -276,6 +276,23 @@ def test_impossible_options_are_refused(
     assert not (teacher / "course_evaluation.json").exists()
 
 
+def test_a_bare_artifact_finds_its_controller_beside_it(
+    module: Module, deciders: ModuleType, teacher: Path, untrained: Path, tmp_path: Path
+) -> None:
+    shelf, artifacts = tmp_path / "shelf", module("tsc_artifacts")
+    controller = Artifact.load(untrained)
+    others = {name: tensor + 1.0 for name, tensor in controller.state.items()}
+    manifest = {name: value for name, value in controller.manifest.items() if name != "weights"}
+    Artifact.save(shelf / "another", others, manifest)
+    Artifact.save(shelf / "controller", controller.state, manifest)
+    (shelf / "broken").mkdir()
+    (shelf / "broken" / "manifest.json").write_text("{")
+    decided = Artifact.load(teacher)
+    Artifact.save(shelf / "teacher", decided.state, decided.manifest)
+    assert artifacts.trained_bbc(artifacts.load_trained(shelf / "teacher", "teacher")) == shelf / "controller"
+    assert deciders.load_decider(shelf / "teacher", None).controller.artifact.folder == shelf / "controller"
+
+
 def test_the_wrong_artifact_is_refused(
     deciders: ModuleType, recipe: ModuleType, config: Any, teacher: Path, untrained: Path
 ) -> None:
