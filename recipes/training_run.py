@@ -162,7 +162,12 @@ def _run(
     if resumed:
         saved.load()
     else:
-        begin(parts, cfg)
+        try:
+            begin(parts, cfg)
+        except BaseException:  # nothing is learned yet, and the name stays free
+            if first:
+                cli.abandon_run(folder)
+            raise
         distributed.share(part for part in parts.alike.values() if isinstance(part, nn.Module))
     logger = MCAPLogger(folder.name, folder.parent, resume=resumed) if first else None
     start = time.monotonic() - 60.0 * progress["minutes"]

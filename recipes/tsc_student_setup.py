@@ -178,11 +178,15 @@ def load_student(parts: Components, path: Path) -> None:
         ArtifactError: if it is none, or has other sizes.
     """
     trained = load_trained(path, "student")
-    if trained.network.settings != parts.student.settings:
+    # A student is told what to do and draws nothing: what its teacher's deviations were makes no difference.
+    own, wanted = (
+        {name: value for name, value in network.settings.items() if name not in ("initial_std", "min_std")}
+        for network in (trained.network, parts.student)
+    )
+    if own != wanted:
         raise ArtifactError(
-            f"{trained.artifact.folder}: the student has {trained.network.settings}, this run builds "
-            f"{parts.student.settings}; give the same --memory, --encoder-hidden and "
-            "--heading-gate, and a teacher of the same sizes"
+            f"{trained.artifact.folder}: the student has {own}, this run builds {wanted}; give the same --memory, "
+            "--encoder-hidden and --heading-gate, and a teacher of the same sizes"
         )
     parts.student.load_state_dict(trained.network.state_dict())
 

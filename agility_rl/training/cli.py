@@ -183,6 +183,15 @@ def start_run(config: Any, folder: str | Path, *, resume: bool = False, **extra:
     return folder
 
 
+def abandon_run(folder: str | Path) -> None:
+    """Free the name of a run that :func:`start_run` began and that could not go on; anything but its record stays."""
+    folder = Path(folder)
+    (folder / CONFIG_FILE).unlink(missing_ok=True)
+    for empty in (*folder.iterdir(), folder):
+        with contextlib.suppress(OSError):
+            empty.rmdir()
+
+
 def read_config(folder: str | Path, kind: type[C]) -> C:
     """Configuration of a run, from its ``config.json``, as the recipe's dataclass.
 

@@ -179,8 +179,13 @@ def test_another_camera_another_teacher_and_other_sizes_are_refused(
     wrong = make_student("wrong", camera=seen)
     with pytest.raises(ValueError, match=r"images of image \[60, 106\], this code's camera has \[58, 87\]"):
         recipe.train(replace(smoke, init_from=wrong))
+    assert not (smoke.runs / smoke.name).exists(), "the name stays free"
     with pytest.raises(ValueError, match=r"'memory': 16.*give the same --memory"):
         recipe.train(replace(smoke, name="larger", memory=17, init_from=make_student()))
+    bold = Artifact.load(make_student("bold"))
+    network = bold.manifest["network"] | {"initial_std": 0.9, "min_std": 0.2}
+    Artifact.save(bold.folder, bold.state, bold.manifest | {"network": network})
+    recipe.train(replace(smoke, name="timid", init_from=bold.folder, iterations=0))  # a student tries nothing out
     run = recipe.train(replace(smoke, name="mine", iterations=0))
     other = Artifact.load(smoke.teacher / "policy")
     weights = {name: value + 1.0 for name, value in other.state.items()}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from agility_rl.training.cli import from_json, from_presets, read_config, start_run, to_json, versions
+from agility_rl.training.cli import abandon_run, from_json, from_presets, read_config, start_run, to_json, versions
 
 
 @dataclass(frozen=True)
@@ -116,6 +116,18 @@ def test_a_run_folder_is_never_overwritten(tmp_path: Path) -> None:
         assert (folder / f"config.resumed-{number}.json").is_file()
     with pytest.raises(FileNotFoundError, match="nothing to resume"):
         start_run(config, tmp_path / "none", resume=True)
+
+
+def test_a_run_that_cannot_begin_leaves_its_name_free(tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "mine"
+    start_run(PRESETS["cpu"], run)
+    (run / "checkpoints").mkdir()
+    abandon_run(run)
+    assert not run.exists() and run.parent.exists()
+    start_run(PRESETS["cpu"], run)
+    (run / "notes.txt").write_text("mine")
+    abandon_run(run)
+    assert [path.name for path in run.iterdir()] == ["notes.txt"]
 
 
 def test_json_round_trip_and_unknown_fields() -> None:
