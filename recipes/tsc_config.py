@@ -95,8 +95,7 @@ class RewardConfig:
     reach_goal: float = 5.0
     """Weight of being at a way-point, for the two control steps until the next one counts (section 5.6)."""
     termination: float = TERMINATION
-    """Weight of a failure, for one control step (section 5.6). What it costs beside is the rest of the course; as
-    published it costs so little that a fifth of the obstacles is given up for speed."""
+    """Weight of a failure, for one control step (section 5.6). The rest of the course is lost besides."""
 
 
 @dataclass(frozen=True)
