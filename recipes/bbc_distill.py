@@ -71,7 +71,7 @@ class Config:
     mirrored: tuple[tuple[str, Side], ...] = ()
     """Behaviour and the side to which its teacher turns well: to the other it acts in a mirror (``mirroring.py``)."""
     env: bbc_config.EnvConfig = field(default_factory=lambda: ENVIRONMENT)
-    """Where they walk. The joints' dry friction is that of the teachers' simulator."""
+    """Where they walk. The joints' dry friction is that of the teachers' simulator; rewards are not used."""
     rounds: int = 24
     teacher_rounds: int = 2
     """First rounds in which the teachers act."""

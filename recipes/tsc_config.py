@@ -63,6 +63,9 @@ class PPOConfig:
     """Which continuous dimensions count (``all``: method notes, section 5.2)."""
     entropy: float = 0.01
     """Of both parts (method notes, section 5.2)."""
+    bounds: float | None = None
+    """Weight of means beyond [-1, 1], where the environment clips the parameters and nothing that is tried makes a
+    difference (ours)."""
     value: float = 1.0
     max_grad_norm: float = 1.0
     precision: Precision = "float32"

@@ -117,6 +117,7 @@ def build(cfg: Config) -> Components:
         critic_coeff=ppo.value,
         discrete_entropy_coeff=ppo.entropy,
         continuous_entropy_coeff=ppo.entropy,
+        bounds_coeff=ppo.bounds,
     )
 
     def divergence(sample: TensorDictBase) -> Tensor:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from hardware import simulator_options, training_device
 from rollouts import Controller
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 from tsc_artifacts import Trained, load_bbc_of, load_trained, trained_bbc
@@ -132,7 +134,7 @@ def build(cfg: Config, trained: Trained) -> Components:
         collector=DAggerCollector(
             env,
             student.policy(assisted=True),
-            teacher.privileged_policy(),
+            applied(teacher.privileged_policy()),
             imitation.steps,
             initial_hidden=student.initial_hidden(env.num_robots),
             bits=cfg.bits,
@@ -169,6 +171,17 @@ def make_representation(cfg: Config, student: RecurrentStudent) -> Representatio
     loss = BYOLLoss(byol.to(next(student.parameters()).device))
     parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
     return Representation(loss, SoftUpdate(loss, eps=own.decay), torch.optim.Adam(parameters, lr=own.learning_rate))
+
+
+def applied(policy: TensorDictSequential) -> TensorDictSequential:
+    """A policy that says the parameters of its decisions as the environment applies them, clipped to [-1, 1].
+
+    A teacher's mean may lie far beyond, since nothing there makes a difference to it: half of its forward speeds did.
+    To copy those numbers is no use to a student, and takes most of what it can learn.
+    """
+    parameters = (keys.ACTION, keys.PARAMETERS)
+    clip = TensorDictModule(partial(torch.clamp, min=-1.0, max=1.0), in_keys=[parameters], out_keys=[parameters])
+    return TensorDictSequential(*policy, clip)
 
 
 def load_student(parts: Components, path: Path) -> None:

@@ -32,9 +32,14 @@ class HybridPPOLoss(KeyedLoss):
     no information about the advantage: leaving them out takes noise from the gradient and leaves the selected one the
     whole clipping range, and their deviations move only while their choice is tried.
 
+    An environment that clips parameters to [-1, 1] gives a mean far outside no gradient: whatever is tried, the same is
+    done. ``bounds_coeff`` holds means back, by the part of each that lies beyond:
+
+    .. math:: w_B E \left\| \max(|\mu| - 1, 0) \right\|^2
+
     Source: section S2, algorithm S3 ("Hybrid-PPO"); clip 0.2: Table S4; two surrogates, all blocks, entropy
     coefficients 0.01, mean over dimensions: released code (method notes, section 5.2); Fan et al. 2019,
-    arXiv:1903.01344. ``"selected"`` is in neither.
+    arXiv:1903.01344. ``"selected"`` and the bounds are in neither.
 
     Advantages come from outside, for example from :class:`torchrl.objectives.value.GAE`; normalise them before. All
     coefficients are already applied to the losses returned.
@@ -51,6 +56,7 @@ class HybridPPOLoss(KeyedLoss):
         loss_discrete, loss_continuous            clipped surrogates; gradient to the actor
         loss_critic                               squared error; gradient to the critic
         loss_entropy                              both entropies, weighted, negative; gradient to the actor
+        loss_bounds                               means beyond [-1, 1], weighted; only with a coefficient; to the actor
         clip_fraction_discrete, _continuous       share of ratios outside the clip
         kl_discrete, kl_continuous                KL(old || new) [nat], estimated from the ratios
         entropy_discrete, entropy_continuous      H_D and H_C / n [nat]
@@ -64,6 +70,7 @@ class HybridPPOLoss(KeyedLoss):
         critic_coeff: weight of the critic's error; schedulable.
         discrete_entropy_coeff: weight of the choice's entropy; schedulable.
         continuous_entropy_coeff: weight of the parameters' mean entropy; schedulable.
+        bounds_coeff: weight of means beyond [-1, 1]; schedulable. ``None`` leaves the term out.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
     Raises:
@@ -115,13 +122,8 @@ class HybridPPOLoss(KeyedLoss):
     critic: TensorDictModule
     critic_params: TensorDictParams
     target_critic_params: TensorDictParams
-    out_keys = [
-        *("loss_discrete", "loss_continuous", "loss_critic", "loss_entropy"),
-        *("clip_fraction_discrete", "clip_fraction_continuous", "kl_discrete", "kl_continuous"),
-        *("entropy_discrete", "entropy_continuous"),
-    ]
     _schedulable_buffers = frozenset(
-        {"clip_epsilon", "critic_coeff", "discrete_entropy_coeff", "continuous_entropy_coeff"}
+        {"clip_epsilon", "critic_coeff", "discrete_entropy_coeff", "continuous_entropy_coeff", "bounds_coeff"}
     )
 
     def __init__(
@@ -134,6 +136,7 @@ class HybridPPOLoss(KeyedLoss):
         critic_coeff: float = 1.0,
         discrete_entropy_coeff: float = 0.01,
         continuous_entropy_coeff: float = 0.01,
+        bounds_coeff: float | None = None,
         reduction: str | None = None,
     ) -> None:
         super().__init__()
@@ -147,6 +150,7 @@ class HybridPPOLoss(KeyedLoss):
         self.register_coeff_buffer("critic_coeff", critic_coeff)
         self.register_coeff_buffer("discrete_entropy_coeff", discrete_entropy_coeff)
         self.register_coeff_buffer("continuous_entropy_coeff", continuous_entropy_coeff)
+        self.register_coeff_buffer("bounds_coeff", bounds_coeff)
         self._set_in_keys()
 
     def _set_in_keys(self) -> None:
@@ -154,6 +158,16 @@ class HybridPPOLoss(KeyedLoss):
         entries = [*self.actor.in_keys, *self.critic.in_keys, keys.discrete_action, keys.continuous_action]
         entries += [keys.discrete_log_prob, keys.continuous_log_prob, keys.advantage, keys.value_target]
         self._in_keys = list(dict.fromkeys(unravel_key(key) for key in entries))
+
+    @property
+    def out_keys(self) -> list[str]:
+        """Everything that is written."""
+        return [
+            *("loss_discrete", "loss_continuous", "loss_critic", "loss_entropy"),
+            *(["loss_bounds"] if self.bounds_coeff is not None else []),
+            *("clip_fraction_discrete", "clip_fraction_continuous", "kl_discrete", "kl_continuous"),
+            *("entropy_discrete", "entropy_continuous"),
+        ]
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -188,6 +202,10 @@ class HybridPPOLoss(KeyedLoss):
             out.set(f"loss_{head}", self._reduce_loss(surrogate, tensordict))
         out.set("loss_critic", self.critic_coeff * self._reduce_loss(error, tensordict))
         out.set("loss_entropy", -self._reduce_loss(bonus, tensordict))
+        if self.bounds_coeff is not None:
+            beyond = (continuous.mean.abs() - 1.0).clamp(min=0.0).square().sum(-1)
+            excess = self._counted(beyond, choice, advantage.ndim)
+            out.set("loss_bounds", self.bounds_coeff * self._reduce_loss(excess, tensordict))
         with torch.no_grad():
             for head, ratio in log_ratio.items():
                 outside = ratio.expm1().abs() > self.clip_epsilon

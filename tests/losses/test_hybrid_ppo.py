@@ -237,6 +237,31 @@ def test_the_exact_divergence(continuous: Any) -> None:
         assert losses[f"kl_{head}"].item() == pytest.approx(divergence[head].item(), rel=0.1)
 
 
+@BOTH
+def test_means_beyond_their_bounds_are_held_back(continuous: Any) -> None:
+    actor, critic = networks()
+    weight, bias = actor.network.parameters_head.mean.parameters()
+    with torch.no_grad():
+        weight.zero_()
+        bias.copy_(torch.tensor([0.5, 3.0, -1.5, -0.9, 1.0, 2.0]))
+    td = collect(actor, 5)
+    td["action", "behaviour"] = torch.tensor([0, 0, 1, 2, 2])
+    plain = HybridPPOLoss(actor, critic, continuous=continuous)
+    loss = HybridPPOLoss(actor, critic, continuous=continuous, bounds_coeff=0.1)
+    assert "loss_bounds" not in plain(td) and "loss_bounds" not in plain.out_keys
+    found = loss(td)
+    blocks = torch.tensor([2.0**2, 0.5**2, 1.0**2])  # of the three choices
+    expected = blocks.sum() if continuous == "all" else blocks[td["action", "behaviour"]].mean()
+    torch.testing.assert_close(found["loss_bounds"], 0.1 * expected)
+    assert set(loss.out_keys) == set(found.keys())
+    own = [value for value in loss.actor_params.flatten_keys().values() if torch.equal(value, bias)]
+    (gradient,) = torch.autograd.grad(found["loss_bounds"], own)
+    assert (gradient != 0.0).tolist() == [False, True, True, False, False, True]
+    assert (gradient[[1, 5]] > 0.0).all() and gradient[2] < 0.0  # back towards the bounds
+    loss.bounds_coeff = 0.2
+    torch.testing.assert_close(loss(td)["loss_bounds"], 2.0 * found["loss_bounds"])
+
+
 def test_nested_keys_and_set_keys() -> None:
     actor = HybridActor(
         4, 3, (3, 2), in_keys=[("o", "x")], hidden=(8,), choice_key=("a", "b", "which"), parameters_key="how"

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 
+from agility_rl import keys
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.deploy.task import describe_camera
 from agility_rl.go2 import camera
@@ -117,6 +118,18 @@ def test_sixteen_bits_without_byol_from_another_student(recipe: ModuleType, smok
     assert other.manifest["byol"] is False
     run = recipe.train(replace(child, name="sixteen", iterations=1))
     assert "loss_byol" not in read_scalars(run) and "loss_behaviour" in read_scalars(run)
+
+
+def test_labels_are_what_is_applied(module: Module, smoke: Any) -> None:
+    """A teacher that says far more than the environment takes is copied in what it takes."""
+    setup = module("tsc_student_setup")
+    parts = setup.build(*setup.resolve(smoke))
+    with torch.no_grad():
+        *_, bias = parts.teacher.actor.network.parameters_head.mean.parameters()
+        bias.fill_(5.0)
+    label = parts.collector.collect()[keys.LABEL]
+    assert (label[keys.PARAMETERS] == 1.0).all() and label[keys.BEHAVIOUR].max() < 5
+    parts.env.close()
 
 
 def test_learning_rates_fall_linearly(module: Module) -> None:
