@@ -27,7 +27,8 @@ READ = (keys.OBSTACLE, keys.HEADING_ERROR)
 def clone(parts: Components, cfg: CloningConfig) -> dict[str, float]:
     """Copy a script in several roll-outs; returns the losses of the last minibatch.
 
-    Where the script says nothing, the teacher is held to what it said before.
+    Where the script says nothing, the teacher is held to what it did before: to its parameters as the environment
+    applies them, clipped to [-1, 1]. A script of ``own`` alone brings back means that have left that range.
 
     Source: ours; robots that the teacher drives are labelled too, as in DAgger (Ross et al. 2011, arXiv:1011.0686).
 
@@ -73,7 +74,8 @@ def targets(told: TensorDictBase, before: TensorDictBase, smoothing: float, allo
     silent = told[keys.BEHAVIOUR] < 0
     chosen = F.one_hot(told[keys.BEHAVIOUR].clamp(min=0), len(allowed)) * (1.0 - smoothing)
     wanted = torch.where(silent[:, None], before["logits"].softmax(-1), chosen + smoothing * allowed / allowed.sum())
-    parameters = torch.where(silent[:, None, None], before["loc"], told[keys.PARAMETERS])
+    applied = before["loc"].clamp(-1.0, 1.0)
+    parameters = torch.where(silent[:, None, None], applied, told[keys.PARAMETERS])
     return TensorDict({keys.BEHAVIOUR: wanted, keys.PARAMETERS: parameters}, told.batch_size)
 
 

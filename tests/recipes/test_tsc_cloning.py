@@ -44,6 +44,9 @@ def test_losses_by_hand(module: Module) -> None:
     losses = cloning.imitation(said, cloning.targets(told, said, 0.2, allowed))
     assert losses["behaviour"].item() == pytest.approx(0.25 * math.log(4.0) + 0.75 * math.log(4.0 / 3.0))
     assert losses["parameters"].item() == 0.0
+    far = said.clone().set("loc", torch.tensor([[[3.0], [-0.5], [-2.0]]]))  # held to what is applied of it
+    kept = cloning.targets(told, far, 0.2, allowed)[keys.PARAMETERS]
+    assert kept.flatten().tolist() == [1.0, -0.5, -1.0]
 
 
 def test_the_script_drives_its_share(module: Module, smoke: Any) -> None:
