@@ -30,9 +30,9 @@ def mirrored(act: Callable[[TensorDictBase], Tensor], side: Side) -> Callable[[T
     sign = 1.0 if side == "left" else -1.0
 
     def both(observation: TensorDictBase) -> Tensor:
-        said = act(observation)
         seen = observation.select(keys.PROPRIOCEPTION, keys.PRIVILEGED, keys.COMMAND, keys.PEAK)
-        image = mirror_joints(act(mirror(seen)))
-        return torch.where(sign * observation[keys.COMMAND][:, TURN, None] < 0.0, image, said)
+        other = sign * seen[keys.COMMAND][:, TURN] < 0.0
+        said = act(torch.where(other, mirror(seen), seen))
+        return torch.where(other[:, None], mirror_joints(said), said)
 
     return both

@@ -53,7 +53,7 @@ class BasicBehaviourController(nn.Module):
         super().__init__()
         self.settings: dict[str, Any] = {"hidden": list(hidden), "initial_std": initial_std, "min_std": min_std}
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
-        self.privileged_encoder = PrivilegedEncoder(NUM_LATENT, NUM_LATENT)
+        self.privileged_encoder = PrivilegedEncoder(features.NUM_PRIVILEGED, NUM_LATENT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
         inputs = {
             keys.PROPRIOCEPTION: features.NUM_PROPRIOCEPTION,

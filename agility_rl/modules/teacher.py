@@ -67,7 +67,7 @@ class Teacher(nn.Module):
             "allowed": None if allowed is None else list(allowed),
         }
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
-        self.privileged_encoder = PrivilegedEncoder(NUM_LATENT, NUM_LATENT)
+        self.privileged_encoder = PrivilegedEncoder(features.NUM_PRIVILEGED, NUM_LATENT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
         self.scandots_encoder = ScandotsEncoder()
         inputs = {

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from agility_rl import keys
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.randomization import NOMINAL, Randomization, sample_parameters, uniform
+from agility_rl.go2 import features
 
 Build = Callable[..., LocomotionEnv]
 
@@ -41,12 +42,18 @@ def test_joints_are_drawn_apart(generator: torch.Generator) -> None:
 
 def test_privileged_layout(generator: torch.Generator) -> None:
     fields, privileged = sample_parameters(3, Randomization(), generator)
-    assert privileged.shape == (3, 29)
-    assert torch.equal(privileged[:, :1], fields["trunk_mass_offset"])
-    assert torch.equal(privileged[:, 1:4], fields["trunk_com_offset"])
-    assert torch.equal(privileged[:, 4:5], fields["ground_friction"])
-    torch.testing.assert_close(privileged[:, 5:17], fields["stiffness"] / 40.0 - 1.0, atol=1e-6, rtol=0)
-    torch.testing.assert_close(privileged[:, 17:], fields["damping"] / 1.0 - 1.0, atol=1e-6, rtol=0)
+    columns = privileged.split([entry.size for entry in features.PRIVILEGED_LAYOUT], -1)
+    described = dict(zip((entry.name for entry in features.PRIVILEGED_LAYOUT), columns, strict=True))
+    expected = {
+        "trunk_mass": fields["trunk_mass_offset"],
+        "trunk_com": fields["trunk_com_offset"],
+        "ground_friction": fields["ground_friction"],
+        "stiffness": fields["stiffness"] / 40.0 - 1.0,
+        "damping": fields["damping"] / 1.0 - 1.0,
+    }
+    assert described.keys() == expected.keys()
+    for name, value in expected.items():
+        torch.testing.assert_close(described[name], value, atol=1e-6, rtol=0, msg=name)
 
 
 def test_nominal(generator: torch.Generator) -> None:
