@@ -34,6 +34,10 @@ class Row:
         steps: mean of the control steps simulated.
         budget: control steps that were allowed.
         seconds: mean wall time.
+        behind: by how much its error exceeds that of the first method, mean over the targets that both searched;
+            ``None`` for the first one itself, or without such targets. Of two methods on the same targets this says
+            more than their intervals, most of which comes from targets that are hard for both.
+        behind_interval: half-width of its 95 % confidence interval.
     """
 
     condition: str
@@ -46,10 +50,13 @@ class Row:
     steps: float
     budget: float
     seconds: float
+    behind: float | None
+    behind_interval: float | None
 
 
 def summarize(results: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> list[Row]:
     """A row for every condition and method that has a result, in the order of ``methods``."""
+    first = methods[0]
     rows = []
     for condition in dict.fromkeys(result["condition"] for result in results):
         here = [result for result in results if result["condition"] == condition]
@@ -59,6 +66,11 @@ def summarize(results: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> l
                 continue
             found = [entry for _, entry in known]
             errors = [entry["mean_error"] for entry in found]
+            behind = [
+                entry["mean_error"] - result["methods"][first]["mean_error"]
+                for result, entry in known
+                if method != first and first in result["methods"]
+            ]
             rows.append(
                 Row(
                     condition,
@@ -71,6 +83,8 @@ def summarize(results: Sequence[Mapping[str, Any]], methods: Sequence[str]) -> l
                     fmean(entry["steps"] for entry in found),
                     fmean(result["budget"] for result, _ in known),
                     fmean(entry["seconds"] for entry in found),
+                    fmean(behind) if behind else None,
+                    half_width(behind),
                 )
             )
     return rows
@@ -97,10 +111,13 @@ def _covered(known: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> fl
 def cells(row: Row) -> list[str]:
     """A row as text."""
     interval = "" if row.interval is None else f" ± {100 * row.interval:.1f}"
+    behind = "" if row.behind is None else f"{100 * row.behind:+.1f}"
+    behind += "" if row.behind_interval is None else f" ± {100 * row.behind_interval:.1f}"
     return [
         row.method,
         str(row.targets),
         f"{100 * row.error:.1f}{interval}",
+        behind,
         *(f"{100 * error:.1f}" for error in row.parameters.values()),
         "" if row.covered is None else f"{100 * row.covered:.0f}",
         f"{row.steps / 1e6:.3g}",
@@ -111,7 +128,7 @@ def cells(row: Row) -> list[str]:
 def header(row: Row) -> list[str]:
     """Names of the columns of :func:`cells`."""
     names = [name.replace("_", " ").replace("stiffness", "P").replace("damping", "D") for name in row.parameters]
-    return ["method", "targets", "mean error %", *names, "covered %", "million steps", "seconds"]
+    return ["method", "targets", "mean error %", "behind the first", *names, "covered %", "million steps", "seconds"]
 
 
 def markdown(rows: Sequence[Row]) -> str:
@@ -124,8 +141,9 @@ def markdown(rows: Sequence[Row]) -> str:
         lines += [_line(columns), _line(["---", *["---:"] * (len(columns) - 1)])]
         lines += [*(_line(cells(row)) for row in entries), ""]
     lines += [
-        f"Mean over targets ± half of its {CONFIDENCE:.0%} confidence interval; P and D are stiffness and damping; "
-        f"covered: truths within {DEVIATIONS:g} of the method's own deviations.",
+        f"Mean over targets ± half of its {CONFIDENCE:.0%} confidence interval; behind the first: by how much the "
+        "error exceeds the first method's on the same targets; P and D are stiffness and damping; covered: truths "
+        f"within {DEVIATIONS:g} of the method's own deviations.",
         "",
     ]
     return "\n".join(lines)

@@ -239,8 +239,30 @@ def test_the_table_by_hand(module: Module) -> None:
     assert noisy.interval is None and noisy.covered == 1.0
     text = table.markdown(rows)
     assert "## clean (budget 2 million control steps)" in text
-    assert "| sysid | 2 | 10.0 ± 63.5 | 20.0 | 0.0 | 50 | 1.5 | 20 |" in text
-    assert "| sysid | 1 | 0.0 | 0.0 | 0.0 | 100 | 1.5 | 20 |" in text
+    assert "| sysid | 2 | 10.0 ± 63.5 |  | 20.0 | 0.0 | 50 | 1.5 | 20 |" in text
+    assert "| sysid | 1 | 0.0 |  | 0.0 | 0.0 | 100 | 1.5 | 20 |" in text
+
+
+def test_methods_are_compared_target_by_target(module: Module) -> None:
+    table = module("easi_table")
+
+    def result(**errors: float) -> dict[str, Any]:
+        def found(error: float) -> dict[str, Any]:
+            values = {"value": {"hip_damping": 1.0}, "error": {"hip_damping": error}, "mean_error": error}
+            return values | {"spread": [None], "steps": 1, "seconds": 1.0}
+
+        methods = {method: found(error) for method, error in errors.items()}
+        return {"condition": "noisy", "budget": 1, "truth": {"hip_damping": 1.0}, "methods": methods}
+
+    # By itself each is anywhere from .02 to .22; on the same targets one misses by .02 and .04 more than the other.
+    results = [result(easi=0.02, cma_es=0.04), result(easi=0.18, cma_es=0.22), result(cma_es=0.5)]
+    easi, cma_es = table.summarize(results, ["easi", "cma_es"])
+    assert easi.behind is None and easi.behind_interval is None
+    assert cma_es.targets == 3 and cma_es.behind == pytest.approx(0.03), "the third was not searched by both"
+    assert cma_es.behind_interval == pytest.approx(12.706 * (0.02 / 2**0.5) / 2**0.5, rel=1e-3)
+    assert "| +3.0 ± 12.7 |" in table.markdown([easi, cma_es])
+    (alone,) = table.summarize(results, ["cma_es"])
+    assert alone.behind is None, "nothing to be behind of"
 
 
 @pytest.mark.parametrize(
