@@ -19,9 +19,9 @@ MIN_STEPS = 100
 """Fewer rows (2 s) are refused: one stride or two tell no parameters apart. The paper uses 4,000."""
 STOP_TOLERANCE = 0.2
 """Joints may often be measured this far beyond their stops [rad]; more means another order, unit or zero."""
-LANDING_TOLERANCE, LANDING_SHARE = 0.5, 0.05
+LANDING_TOLERANCE, LANDING_SHARE = 0.8, 0.05
 """Joints may be measured this far beyond their stops [rad] in this share of the rows: simulated stops are soft, and a
-weak leg that lands is pressed 0.3 rad beyond them."""
+weak leg that lands is pressed 0.3 rad beyond them, at times 0.5. Another order or unit shows in most rows."""
 RATE_TOLERANCE = 0.02
 """Relative deviation of the median period from the control step."""
 PERIOD_TOLERANCE = 0.5
