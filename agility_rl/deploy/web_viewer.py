@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import ipaddress
 import json
 import os
@@ -52,6 +51,30 @@ COLUMN = 120.0
 """Where the second column of the panel begins [pixels]; two spaces in a line lead there."""
 LOCAL_PAGES = r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"
 """Addresses of pages that may talk to a viewer on this machine, also through a tunnel."""
+HOLD_LONG_ENOUGH = b"""<script>
+  // The viewer asks once a picture what is held. On a page that draws slowly, a stop that is pressed and let go between
+  // two pictures would never be heard: what goes down stays down for two pictures.
+  const drawn = new Map();
+  const count = () => { drawn.forEach((n, what) => drawn.set(what, n + 1)); requestAnimationFrame(count); };
+  requestAnimationFrame(count);
+  const what = (event) => event.code ?? event.type.replace(/down|up/, "") + event.button;
+  for (const down of ["keydown", "mousedown", "pointerdown"])
+    addEventListener(down, (event) => { if (!event.repeat) drawn.set(what(event), 0); }, true);
+  for (const up of ["keyup", "mouseup", "pointerup"])
+    addEventListener(up, (event) => {
+      if (!event.isTrusted || (drawn.get(what(event)) ?? 2) >= 2) return;
+      event.stopImmediatePropagation();
+      const again = new event.constructor(up, event), target = event.target;
+      const later = () => {
+        if (drawn.get(what(event)) >= 2) target.dispatchEvent(again);
+        else requestAnimationFrame(later);
+      };
+      requestAnimationFrame(later);
+    }, true);
+</script>
+"""
+"""Script of the page, ahead of the viewer's own."""
+_HEAD = b"<head>"
 _COLOURS = {
     "title": (1.0, 1.0, 1.0, 1.0),
     "good": (0.45, 0.9, 0.5, 1.0),
@@ -76,6 +99,20 @@ def pages(address: str) -> re.Pattern[str]:
     return re.compile(rf"{LOCAL_PAGES}|https?://{own}(:\d+)?")
 
 
+def with_script(process_request: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """What answers requests, with :data:`HOLD_LONG_ENOUGH` in the page."""
+
+    def answer(connection: Any, request: Any) -> Any:
+        response = process_request(connection, request)
+        if response is not None and _HEAD in response.body:
+            response.body = response.body.replace(_HEAD, _HEAD + HOLD_LONG_ENOUGH, 1)
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(response.body))
+        return response
+
+    return answer
+
+
 def guard(address: str, spoke: Callable[[], None]) -> None:
     """Make the viewer's server refuse pages of other sites, and say when the page with the controls speaks.
 
@@ -94,7 +131,11 @@ def guard(address: str, spoke: Callable[[], None]) -> None:
                 spoke()
             return message
 
-    web_server.serve = functools.partial(serve, origins=[None, pages(address)], create_connection=Page)
+    def serve_page(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
+        options |= {"origins": [None, pages(address)], "create_connection": Page}
+        return serve(*args, process_request=with_script(process_request), **options)
+
+    web_server.serve = serve_page
 
 
 class Pulse:

@@ -16,6 +16,7 @@ from websockets.sync.client import connect
 from agility_rl.deploy.browser import SILENCE, BrowserDevice, exposure
 from agility_rl.deploy.controller import Mode
 from agility_rl.deploy.operator import Status
+from agility_rl.deploy.web_viewer import HOLD_LONG_ENOUGH
 from agility_rl.go2.appearance import dress
 from agility_rl.go2.model import build_spec
 from tests.waiting import until
@@ -65,6 +66,16 @@ def test_it_serves_a_page_on_the_loopback_address_and_on_no_other(device: Browse
         everywhere.listen()
         assert all(reachable(address, everywhere.getsockname()[1]) for address in others), "the test itself"
     assert not any(reachable(address, port_of(device)) for address in others)
+
+
+def test_the_page_holds_what_is_pressed_and_is_whole(device: BrowserDevice) -> None:
+    """What the script does in a page: ``test_web_viewer.py``, whose Chromium draws two pictures a second."""
+    with urllib.request.urlopen(device.url, timeout=10) as page:
+        body = page.read()
+        assert int(page.headers["Content-Length"]) == len(body) and page.headers.get_all("Content-Length")[1:] == []
+    assert body.index(HOLD_LONG_ENOUGH) < body.index(b"<title>") and body.rstrip().endswith(b"</html>")
+    with urllib.request.urlopen(device.url + "web_client.js", timeout=10) as script:
+        assert HOLD_LONG_ENOUGH not in script.read()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the kernel's table of sockets")

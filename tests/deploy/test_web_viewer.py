@@ -80,6 +80,8 @@ class Page:
 
     def press(self, key: str) -> None:
         """As long as a finger does."""
+        # A window that nobody looks at has no focus, and a page without focus takes no keys.
+        self.call("Emulation.setFocusEmulationEnabled", enabled=True)
         value, code, number = CODES[key]
         entries = {"key": value, "code": code, "windowsVirtualKeyCode": number}
         self.call("Input.dispatchKeyEvent", type="rawKeyDown", **entries)
