@@ -76,6 +76,10 @@ TERRAIN_LATENT = "terrain_latent"
 HEADING_ERROR = "heading_error"
 """float32 ``[*B, 2]``, angle from the robot's heading to the current and to the next way-point [rad], in (-pi, pi]."""
 
+PLACE = "place"
+"""float32 ``[*B, 8]``, where a robot stands: x, y of its current and of its next way-point in its own frame [m]; its
+x, y [m], sine and cosine of its yaw in the frame of the obstacle to pass."""
+
 OBSTACLE = "obstacle"
 """float32 ``[*B, 7]``, one-hot type of the obstacle to pass; order of :data:`agility_rl.envs.obstacles.OBSTACLES`."""
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from easi_config import PRESETS, Config, CriticConfig, replay_window
+from easi_config import PRESETS, Config, CriticConfig, least_std, replay_window
 from easi_report import (
     draw_convergence,
     identify,
@@ -151,7 +151,7 @@ def build(cfg: Config) -> Components:
             survival_rate=search.survival_rate,
             covariance=search.covariance,
             centre=search.centre,
-            min_std=search.min_std,
+            min_std=least_std(cfg),
             lower=lower,
             upper=upper,
             generator=seeds.generator("search"),

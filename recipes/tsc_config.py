@@ -50,6 +50,9 @@ class PPOConfig:
     minibatches: int = 4
     learning_rate: float = 5e-4
     """Table S4."""
+    critic_learning_rate: float | None = None
+    """The critic's own, which stays; without, it learns at the policy's rate, so hardly where small steps are asked
+    for (ours)."""
     max_learning_rate: float = 1e-2
     desired_kl: float | None = 0.01
     """Of the continuous part (method notes, sections 3.7 and 5.2)."""
@@ -76,6 +79,8 @@ class PPOConfig:
     """At the start; a teacher of ``--init-from`` that has more begins with this."""
     min_std: float = 0.1
     """Floor. A decision is held for ``decision_steps`` only, so that a small deviation hardly moves the robot."""
+    noise_seconds: float | None = None
+    """Time in which noise on the parameters falls to 1/e [s]; without, it is drawn anew at every decision (ours)."""
     hidden: tuple[int, ...] = (512, 256, 128)
     """Supplement S6."""
     critic_warm_up: int = 0
@@ -164,6 +169,9 @@ class Config(HardwareConfig):
     """Run or artifact folder whose teacher to start from."""
     behaviours: tuple[str, ...] = ("walk", "pace", "trot", "canter", "jump")
     """Behaviours that it may choose; the others are never drawn."""
+    place: bool = False
+    """Let it read its way-points and its obstacle in metres (ours); as published it knows directions only. A teacher of
+    ``--init-from`` that did without begins as it is."""
     env: EnvConfig = field(default_factory=EnvConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
@@ -179,6 +187,7 @@ PAPER = Config(
 CPU = Config(
     iterations=3000,
     max_minutes=180.0,
+    place=True,
     env=EnvConfig(num_robots=256, decision_steps=5, randomize=False, push_interval=None),
     ppo=PPOConfig(
         steps=24,

@@ -26,20 +26,22 @@ from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.envs import COURSES, AgilityEnv, Course, load_course
 from agility_rl.envs.agility import COURSE_RANDOMIZATION
 from agility_rl.envs.agility_rewards import AGILITY_REWARDS, AgilityTerm, goal_velocity
+from agility_rl.envs.arena import NUM_PLACE
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import features
 from agility_rl.losses import AdaptationLoss, HybridPPOLoss
 from agility_rl.modules import Critic, Discriminator, FeatureNormalizer, Teacher
-from agility_rl.training.ppo import PPOUpdate
+from agility_rl.training.exploration import LastingNoise
+from agility_rl.training.ppo import FirstGroup, PPOUpdate
 from agility_rl.training.precision import hidden_precision
 from agility_rl.training.rollout import Rollout
 from agility_rl.training.seeding import Seeds, seed_everything
 
 OBSERVED = (
     *(keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.HISTORY),
-    *(keys.HEADING_ERROR, keys.OBSTACLE, keys.SCANDOTS),
+    *(keys.HEADING_ERROR, keys.PLACE, keys.OBSTACLE, keys.SCANDOTS),
 )
-"""What the critic reads (method notes, section 5.4: all of it)."""
+"""What the critic reads (method notes, section 5.4: all of it; where the robot stands: ours)."""
 
 
 @dataclass
@@ -53,6 +55,7 @@ class Components:
     discriminator: Discriminator | None
     curriculum: Curriculum
     rollout: Rollout
+    noise: LastingNoise | None
     advantage: GAE
     adaptation_loss: AdaptationLoss
     privileged_loss: AdaptationLoss
@@ -75,7 +78,8 @@ class Components:
     @property
     def own(self) -> dict[str, Any]:
         """What each process has for itself."""
-        return {name: getattr(self, name) for name in ("seeds", "env", "rollout")}
+        names = ("seeds", "env", "rollout") if self.noise is None else ("seeds", "env", "rollout", "noise")
+        return {name: getattr(self, name) for name in names}
 
 
 def build(cfg: Config) -> Components:
@@ -96,19 +100,19 @@ def build(cfg: Config) -> Components:
         termination_reward=cfg.reward.termination,
     )
     allowed = None if set(cfg.behaviours) == set(BEHAVIOURS) else sorted(skill_index(name) for name in cfg.behaviours)
-    teacher = Teacher(len(OBSTACLES), ppo.hidden, ppo.initial_std, ppo.min_std, allowed).to(device)
+    num_place = NUM_PLACE if cfg.place else 0
+    teacher = Teacher(len(OBSTACLES), ppo.hidden, ppo.initial_std, ppo.min_std, allowed, num_place).to(device)
     teacher.estimator.load_state_dict(controller.bbc.estimator.state_dict())  # method notes, section 5.3
     width = sum(env.observation_spec[key].shape[1:].numel() for key in OBSERVED)
     critic = Critic(width, in_keys=list(OBSERVED), hidden=ppo.hidden).to(device)
     trained = teacher.trained_actor()
-    policy_optimizer = torch.optim.Adam(
-        [
-            *(*teacher.privileged_encoder.parameters(), *teacher.scandots_encoder.parameters()),
-            *(*teacher.actor.parameters(), *critic.parameters()),
-        ],
-        lr=ppo.learning_rate,
-        fused=True,
-    )
+    acting = (teacher.privileged_encoder, teacher.scandots_encoder, teacher.actor)
+    groups = [{"params": [weight for part in acting for weight in part.parameters()]}]
+    if ppo.critic_learning_rate is None:
+        groups[0]["params"] += critic.parameters()
+    else:
+        groups.append({"params": list(critic.parameters()), "lr": ppo.critic_learning_rate})
+    policy_optimizer = torch.optim.Adam(groups, lr=ppo.learning_rate, fused=True)
     loss = HybridPPOLoss(
         trained,
         critic,
@@ -126,7 +130,13 @@ def build(cfg: Config) -> Components:
 
     schedule = None
     if ppo.desired_kl is not None:
-        schedule = KLAdaptiveLR(policy_optimizer, ppo.desired_kl, max_lr=ppo.max_learning_rate)
+        schedule = KLAdaptiveLR(FirstGroup(policy_optimizer), ppo.desired_kl, max_lr=ppo.max_learning_rate)
+    noise = None
+    if ppo.noise_seconds is not None:
+        decision_dt = env.dt * cfg.env.decision_steps
+        noise = LastingNoise(
+            ppo.noise_seconds, decision_dt, seeds.generator("exploration"), (keys.ACTION, keys.PARAMETERS)
+        )
     outcome = [keys.OUTCOME, keys.TERMINATIONS, keys.REWARD_TERMS, keys.MOTION, keys.SKILL, keys.OBSTACLE]
     return Components(
         seeds=seeds,
@@ -142,6 +152,7 @@ def build(cfg: Config) -> Components:
             keep_next=["reward", *outcome],
             value=lambda observation: critic(observation.select(*OBSERVED))["state_value"],
         ),
+        noise=noise,
         advantage=GAE(gamma=ppo.gamma, lmbda=ppo.lmbda, value_network=None, time_dim=0),
         adaptation_loss=AdaptationLoss(teacher.history_encoder, teacher.privileged_encoder),
         privileged_loss=privileged_loss(teacher.privileged_encoder),

@@ -16,7 +16,7 @@ from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.agility_rewards import AGILITY_REWARDS, TERMINATION, TERMINATION_TERM, AgilityTerm
 from agility_rl.envs.agility_state import AgilityState
 from agility_rl.envs.agility_terminations import AGILITY_TERMINATIONS, Termination
-from agility_rl.envs.arena import Arena
+from agility_rl.envs.arena import NUM_PLACE, Arena
 from agility_rl.envs.course import Course
 from agility_rl.envs.course_presets import full_course
 from agility_rl.envs.decisions import COMMAND_NOISE, NUM_PARAMETERS, Decisions
@@ -175,6 +175,7 @@ class AgilityEnv(EnvBase):
                 keys.SKILL: skill,
                 keys.SHIFT: Bounded(-1.0, 1.0, (n, 1), dtype=torch.float32),
                 keys.HEADING_ERROR: group(2),
+                keys.PLACE: group(NUM_PLACE),
                 keys.OBSTACLE: group(len(OBSTACLES)),
                 keys.SCANDOTS: group(NUM_SCANDOTS),
                 **outcome_specs(n, (*self.rewards, TERMINATION_TERM), self.terminations),

@@ -20,6 +20,8 @@ from agility_rl.go2 import constants
 from agility_rl.simulation import Simulator
 from agility_rl.tensors import constant
 
+NUM_PLACE = 8
+"""Numbers of ``keys.PLACE``."""
 START_BEHIND, START_ASIDE, START_TURN = 0.2, 0.1, 0.2
 """Draw of the start: 0 to 0.2 m behind the first way-point, +-0.1 m beside it, +-0.2 rad (method notes, 5.7)."""
 
@@ -141,12 +143,26 @@ class Arena:
         goals = torch.stack(self.progress.goals(), 1) - position[:, None]  # [N, 2 goals, 2]
         return goals[:, 0], rotations.wrap_angle(torch.atan2(goals[..., 1], goals[..., 0]) - yaw[:, None])
 
+    def place(self, position: Tensor, yaw: Tensor) -> Tensor:
+        """``keys.PLACE`` of robots at ``[N, 2]`` [m] with headings ``[N]`` [rad]: ``[N, 8]``."""
+        offset = torch.stack(self.progress.goals(), 1) - position[:, None]
+        forward = torch.stack((yaw.cos(), yaw.sin()), -1)[:, None]
+        ahead = (offset * forward).sum(-1)
+        left = offset[..., 1] * forward[..., 0] - offset[..., 0] * forward[..., 1]
+        obstacle = self.progress.obstacle
+        turned = yaw - self.layout.yaw.gather(1, obstacle[:, None])[:, 0]
+        local = self.layout.local_to(obstacle, position)
+        way_points = torch.stack((ahead, left), -1).flatten(1)
+        return torch.cat((way_points, local, turned.sin()[:, None], turned.cos()[:, None]), -1)
+
     def observe(self, simulator: Simulator, yaw: Tensor) -> TensorDict:
         """What the Task-Specific Controller sees of the course, ``[N]``."""
         parameter = self.layout.parameter(simulator.hinge_angle)
+        position = simulator.root_position[:, :2]
         return TensorDict(
             {
-                keys.HEADING_ERROR: self.heading_error(simulator.root_position[:, :2], yaw)[1],
+                keys.HEADING_ERROR: self.heading_error(position, yaw)[1],
+                keys.PLACE: self.place(position, yaw),
                 keys.OBSTACLE: self.types[self.progress.obstacle].float(),
                 keys.SCANDOTS: self.scan.scandots(simulator.root_position, yaw, parameter),
             },

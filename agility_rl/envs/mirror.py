@@ -18,6 +18,7 @@ from agility_rl import keys
 from agility_rl.envs.scandots import GRID_X, GRID_Y
 from agility_rl.go2 import features
 from agility_rl.go2.mirror import mirror_commands, mirror_features, mirror_joints
+from agility_rl.tensors import constant
 
 
 def _same(value: Tensor) -> Tensor:
@@ -32,6 +33,12 @@ def _image(value: Tensor) -> Tensor:
     return value.flip(-1)
 
 
+def _place(value: Tensor) -> Tensor:
+    return value * constant(_PLACE_SIGNS, value.device, value.dtype)
+
+
+_PLACE_SIGNS = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0)
+"""Of x, y of three points, and of sine and cosine of a yaw."""
 _EXPLICIT = partial(mirror_features, features.EXPLICIT_LAYOUT)
 _PROPRIOCEPTION = partial(mirror_features, features.PROPRIOCEPTION_LAYOUT)
 _IMAGES: dict[NestedKey, Callable[[Tensor], Tensor]] = {
@@ -46,6 +53,7 @@ _IMAGES: dict[NestedKey, Callable[[Tensor], Tensor]] = {
     keys.SKILL: _same,
     keys.SHIFT: _same,
     keys.HEADING_ERROR: torch.neg,
+    keys.PLACE: _place,
     keys.OBSTACLE: _same,
     keys.SCANDOTS: _scandots,
     keys.DEPTH: _image,

@@ -29,7 +29,7 @@ class Teacher(nn.Module):
     Source: supplement S6; inputs: method notes, sections 5.3 and 5.4.
 
     Keys read: ``proprioception`` [*B, 45], ``heading_error`` [*B, 2] [rad], ``obstacle`` [*B, 7], ``scandots``
-    [*B, 132] [m], and ``privileged`` [*B, 29] or ``history`` [*B, 10, 45].
+    [*B, 132] [m], with ``num_place`` also ``place`` [*B, 8], and ``privileged`` [*B, 29] or ``history`` [*B, 10, 45].
     Keys written: ``estimate`` [*B, 4], ``latent`` [*B, 29], ``terrain_latent`` [*B, 32], and those of
     :class:`~agility_rl.modules.HybridActor`.
 
@@ -39,6 +39,8 @@ class Teacher(nn.Module):
         initial_std: standard deviation of the parameters at the start.
         min_std: its floor.
         allowed: indices of the behaviours that it may choose; ``None`` for all.
+        num_place: size of ``place``, way-points and obstacle in metres, which it reads besides; the published teacher
+            (0) knows in which directions its way-points lie and not how far.
 
     Example:
         >>> import torch
@@ -57,6 +59,7 @@ class Teacher(nn.Module):
         initial_std: float = 1.0,
         min_std: float = 0.1,
         allowed: Sequence[int] | None = None,
+        num_place: int = 0,
     ) -> None:
         super().__init__()
         self.settings: dict[str, Any] = {
@@ -65,6 +68,7 @@ class Teacher(nn.Module):
             "initial_std": initial_std,
             "min_std": min_std,
             "allowed": None if allowed is None else list(allowed),
+            "num_place": num_place,
         }
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
         self.privileged_encoder = PrivilegedEncoder(features.NUM_PRIVILEGED, NUM_LATENT)
@@ -77,6 +81,7 @@ class Teacher(nn.Module):
             keys.TERRAIN_LATENT: NUM_TERRAIN_LATENT,
             keys.ESTIMATE: features.NUM_EXPLICIT,
             keys.LATENT: NUM_LATENT,
+            **({keys.PLACE: num_place} if num_place else {}),
         }
         self.actor = HybridActor(
             sum(inputs.values()),

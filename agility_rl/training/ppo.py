@@ -4,6 +4,7 @@ follows the divergence of the policy."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -14,6 +15,29 @@ from agility_rl.training import distributed
 from agility_rl.training.seeding import permutation
 
 Extra = Callable[[TensorDictBase], Tensor]
+
+
+class FirstGroup:
+    """The first group of an optimiser's parameters, for a learning-rate schedule that must leave the others alone.
+
+    Args:
+        optimizer: whose group it is, also after its state was loaded.
+
+    Example:
+        >>> weights = [torch.nn.Parameter(torch.zeros(1)) for _ in range(2)]
+        >>> optimizer = torch.optim.Adam([{"params": weights[:1]}, {"params": weights[1:], "lr": 1e-3}], lr=1e-4)
+        >>> KLAdaptiveLR(FirstGroup(optimizer), 0.01, factor=2.0).step(1.0)
+        >>> [group["lr"] for group in optimizer.param_groups]
+        [5e-05, 0.001]
+    """
+
+    def __init__(self, optimizer: torch.optim.Optimizer) -> None:
+        self.optimizer = optimizer
+
+    @property
+    def param_groups(self) -> list[dict[str, Any]]:
+        """The one group."""
+        return self.optimizer.param_groups[:1]
 
 
 class PPOUpdate:

@@ -93,6 +93,7 @@ def test_shapes_are_those_of_the_documentation(build: Build) -> None:
         keys.COMMAND: (11,),
         keys.MOTION: (2, 49),
         keys.HEADING_ERROR: (2,),
+        keys.PLACE: (8,),
         keys.OBSTACLE: (7,),
         keys.SCANDOTS: (132,),
         (keys.OUTCOME, "success"): (1,),

@@ -100,6 +100,18 @@ def test_heading_errors_by_hand() -> None:
     torch.testing.assert_close(behind[:, 0], torch.tensor([math.pi - 0.5]))
 
 
+def test_place_by_hand() -> None:
+    """A robot that looks along x, and then along y, beside a tunnel that leads along y."""
+    arena, simulator = build("tunnel", n=1)
+    begin(arena, simulator)
+    layout = arena.layout
+    layout.position, layout.yaw = torch.tensor([[[2.0, 3.5]]]), torch.tensor([[math.pi / 2]])
+    place = arena.place(torch.tensor([[1.0, 1.475]]), torch.tensor([0.0]))
+    torch.testing.assert_close(place, torch.tensor([[1.0, 0.0, 1.0, 0.5, -2.025, 1.0, -1.0, 0.0]]), atol=1e-6, rtol=0)
+    turned = arena.place(torch.tensor([[1.0, 1.475]]), torch.tensor([math.pi / 2]))
+    torch.testing.assert_close(turned, torch.tensor([[0.0, -1.0, 0.5, -1.0, -2.025, 1.0, 0.0, 1.0]]), atol=1e-6, rtol=0)
+
+
 def test_observation() -> None:
     arena, simulator = build()
     begin(arena, simulator)

@@ -14,7 +14,7 @@ from agility_rl.go2.mirror import mirror_joints
 
 READ = (
     *(keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.HISTORY, keys.MOTION, keys.COMMAND, keys.PEAK),
-    *(keys.SKILL, keys.SHIFT, keys.HEADING_ERROR, keys.OBSTACLE, keys.SCANDOTS),
+    *(keys.SKILL, keys.SHIFT, keys.HEADING_ERROR, keys.PLACE, keys.OBSTACLE, keys.SCANDOTS),
 )
 WIDTH = 4.0
 

@@ -46,13 +46,35 @@ def test_a_run_writes_what_the_next_stage_needs(recipe: ModuleType, smoke: Any, 
 
 
 def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smoke: Any) -> None:
+    smoke = replace(smoke, ppo=replace(smoke.ppo, noise_seconds=0.2, critic_learning_rate=1e-3))
     whole = recipe.train(replace(smoke, name="whole", iterations=4))
     halves = recipe.train(replace(smoke, name="halves", iterations=2))
     recipe.train(replace(smoke, resume=halves, iterations=4))
     one, other = (Artifact.load(run / "policy").state for run in (whole, halves))
     assert not [name for name in one if not torch.equal(one[name], other[name])]
+    assert read_scalars(whole)["kl_continuous"][1][0].abs() < 1e-3, "the first iteration leaves the policy as it is"
     for name in ("reward/task", "loss_critic", "use/jump"):
         assert torch.equal(read_scalars(whole)[name][1], read_scalars(halves)[name][1]), name
+
+
+def test_a_teacher_learns_to_read_its_place_from_where_it_was(recipe: ModuleType, smoke: Any) -> None:
+    """The new input of the first layer counts nothing at first, and everything else is the parent's."""
+    blind = recipe.train(replace(smoke, name="blind", iterations=1, place=False))
+    parts = recipe.build(replace(smoke, init_from=blind))
+    recipe.begin(parts, replace(smoke, init_from=blind))
+    assert Artifact.load(blind / "policy").manifest["network"]["num_place"] == 0
+    assert parts.teacher.settings["num_place"] == 8
+    parent = Teacher(**Artifact.load(blind / "policy").manifest["network"])
+    Artifact.load(blind / "policy").fill(parent)
+    seen = parts.env.reset()
+    with torch.no_grad():
+        torch.testing.assert_close(
+            parts.teacher.deployable_policy()(seen.clone())["loc"], parent.deployable_policy()(seen.clone())["loc"]
+        )
+        parts.teacher.actor.network.trunk.layers[0].weight[:, -8:] = 1.0
+        moved = parts.teacher.deployable_policy()(seen.clone())["loc"]
+    assert not torch.equal(moved, parent.deployable_policy()(seen.clone())["loc"])
+    parts.env.close()
 
 
 def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
