@@ -187,7 +187,6 @@ PAPER = Config(
 CPU = Config(
     iterations=3000,
     max_minutes=180.0,
-    place=True,
     env=EnvConfig(num_robots=256, decision_steps=5, randomize=False, push_interval=None),
     ppo=PPOConfig(
         steps=24,

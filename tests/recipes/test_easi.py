@@ -142,16 +142,19 @@ def test_the_paper_preset_is_table_s3(easi: ModuleType) -> None:
     assert critic == ("rmsprop", 0.01, None, (128, 128))
 
 
-def test_a_noisy_log_is_replayed_in_longer_windows(easi: ModuleType, log: Path, tmp_path: Path) -> None:
+def test_a_noisy_log_takes_longer_windows_and_a_wide_search(easi: ModuleType, log: Path, tmp_path: Path) -> None:
     cpu = easi.PRESETS["cpu"]
     known = [
         easi.replay_window(replace(cpu, **options))
         for options in ({}, {"noise": 1.0, "latency": 1}, {"latency": 1}, {"window": 8}, {"noise": 1.0, "window": 1})
     ]
     assert known == [(1, 0), (5, 1), (1, 0), (8, 0), (1, 0)]
+    paper, settled = easi.PRESETS["paper"], replace(cpu.search, min_std=0.0)
+    searches = (cpu, replace(cpu, noise=1.0), replace(cpu, noise=1.0, search=settled), replace(paper, noise=1.0))
+    assert [easi.least_std(cfg) for cfg in searches] == [0.0, 0.02, 0.0, 0.0]
     for noise, count, length in ((0.0, 20, 1), (1.0, 4, 4)):
         parts = easi.build(smoke(easi, log, tmp_path, noise=noise))
-        assert parts.collector.num_steps == 20
+        assert parts.collector.num_steps == 20 and parts.search.min_std == (0.02 if noise else 0.0)
         assert parts.collector.collect(parts.search.ask()).shape == (8, count * length)
         parts.simulator.close()
 

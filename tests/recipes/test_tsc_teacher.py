@@ -46,7 +46,7 @@ def test_a_run_writes_what_the_next_stage_needs(recipe: ModuleType, smoke: Any, 
 
 
 def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smoke: Any) -> None:
-    smoke = replace(smoke, ppo=replace(smoke.ppo, noise_seconds=0.2, critic_learning_rate=1e-3))
+    smoke = replace(smoke, place=True, ppo=replace(smoke.ppo, noise_seconds=0.2, critic_learning_rate=1e-3))
     whole = recipe.train(replace(smoke, name="whole", iterations=4))
     halves = recipe.train(replace(smoke, name="halves", iterations=2))
     recipe.train(replace(smoke, resume=halves, iterations=4))
@@ -59,9 +59,10 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smok
 
 def test_a_teacher_learns_to_read_its_place_from_where_it_was(recipe: ModuleType, smoke: Any) -> None:
     """The new input of the first layer counts nothing at first, and everything else is the parent's."""
-    blind = recipe.train(replace(smoke, name="blind", iterations=1, place=False))
-    parts = recipe.build(replace(smoke, init_from=blind))
-    recipe.begin(parts, replace(smoke, init_from=blind))
+    blind = recipe.train(replace(smoke, name="blind", iterations=1))
+    reading = replace(smoke, init_from=blind, place=True)
+    parts = recipe.build(reading)
+    recipe.begin(parts, reading)
     assert Artifact.load(blind / "policy").manifest["network"]["num_place"] == 0
     assert parts.teacher.settings["num_place"] == 8
     parent = Teacher(**Artifact.load(blind / "policy").manifest["network"])
