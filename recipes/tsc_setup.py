@@ -107,7 +107,7 @@ def build(cfg: Config) -> Components:
     critic = Critic(width, in_keys=list(OBSERVED), hidden=ppo.hidden).to(device)
     trained = teacher.trained_actor()
     acting = (teacher.privileged_encoder, teacher.scandots_encoder, teacher.actor)
-    groups = [{"params": [weight for part in acting for weight in part.parameters()]}]
+    groups: list[dict[str, Any]] = [{"params": [weight for part in acting for weight in part.parameters()]}]
     if ppo.critic_learning_rate is None:
         groups[0]["params"] += critic.parameters()
     else:
