@@ -118,10 +118,19 @@ class RecurrentStudent(nn.Module):
 
     @classmethod
     def from_teacher(cls, teacher: Teacher, **options: Any) -> RecurrentStudent:
-        """A student with a teacher's sizes and copies of its actor, estimator and history encoder."""
-        student = cls(**teacher.settings, **options)
-        for name in ("actor", "estimator", "history_encoder"):
+        """A student with a teacher's sizes and copies of its actor, estimator and history encoder.
+
+        It does without the place that some teachers read, since no robot measures it.
+        """
+        settings = dict(teacher.settings)
+        place = settings.pop("num_place")
+        student = cls(**settings, **options)
+        for name in ("estimator", "history_encoder"):
             getattr(student, name).load_state_dict(getattr(teacher, name).state_dict())
+        weights = teacher.actor.state_dict()
+        first = next(name for name, weight in weights.items() if weight.ndim == 2)
+        weights[first] = weights[first][:, : weights[first].shape[1] - place]  # it is the last input
+        student.actor.load_state_dict(weights)
         return student
 
     def initial_hidden(self, num_robots: int) -> Tensor:

@@ -136,6 +136,21 @@ def test_from_a_teacher() -> None:
         torch.testing.assert_close(student.actor(known)["loc"], expected["loc"])
 
 
+def test_from_a_teacher_that_reads_its_place() -> None:
+    """The student has everything but the place: it does what the teacher does where all of that is 0."""
+    teacher = Teacher(hidden=(32, 16), num_place=8)
+    student = RecurrentStudent.from_teacher(teacher, memory=M)
+    assert "num_place" not in student.settings
+    td = steps(1, 3)[0].update({"obstacle": torch.eye(7)[:3], "scandots": torch.randn(3, 132)})
+    with set_interaction_type(InteractionType.DETERMINISTIC):
+        nowhere = teacher.deployable_policy()(td.clone().set("place", torch.zeros(3, 8)))
+        somewhere = teacher.deployable_policy()(td.clone().set("place", torch.ones(3, 8)))
+        known = td.update({"perceived": {"heading_error": td["heading_error"], "obstacle": td["obstacle"]}})
+        known.update(nowhere.select("terrain_latent", "estimate", "latent"))
+        torch.testing.assert_close(student.actor(known)["loc"], nowhere["loc"])
+    assert not torch.allclose(nowhere["loc"], somewhere["loc"])
+
+
 def test_gradients(student: RecurrentStudent) -> None:
     td = student.policy(sequence=True)(steps(3, 2))
     td["loc"].sum().backward(retain_graph=True)
