@@ -14,7 +14,6 @@ Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from course_metrics import judge, set_course
 from held_fixed import fit, infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torch.nn.functional import pad
 from training_run import Laps, own_options, run
 from tsc_cloning import clone
 from tsc_config import PRESETS, Config
@@ -36,7 +34,7 @@ from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.losses import functional
-from agility_rl.modules import Teacher
+from agility_rl.modules.teacher import resize_place
 from agility_rl.training import cli
 
 HEADLINE: tuple[str, ...] = (
@@ -99,22 +97,16 @@ def begin(parts: Components, cfg: Config) -> None:
     """Where a new run starts from: another run's teacher, a copied script, or the one corrected by the other."""
     if cfg.init_from is not None:
         start = Artifact.load(cfg.init_from, kind="teacher")
-        replace(start, state=with_place(start.state, parts.teacher)).fill(parts.teacher)
+        had, place = start.manifest.get("network", {}).get("num_place", 0), parts.teacher.settings["num_place"]
+        if had < place:  # who did not read its place goes on as it was; who did is refused by a run without
+            start = replace(start, state=resize_place(start.state, place - had))
+        start.fill(parts.teacher)
         head = parts.teacher.actor.network.parameters_head
         head.min_std.fill_(cfg.ppo.min_std)
         head.std.data.clamp_(cfg.ppo.min_std, cfg.ppo.initial_std)
     if copies(cfg):
         set_course(parts.env, parts.curriculum)
         clone(parts, cfg.cloning)
-
-
-def with_place(state: Mapping[str, Tensor], teacher: Teacher) -> dict[str, Tensor]:
-    """Weights of a teacher that may not have read its place, for one that does: the new input counts nothing yet."""
-    place, widest = teacher.settings["num_place"], dict(state)
-    for name, weight in teacher.actor.state_dict(prefix="actor.").items():
-        if name in state and weight.ndim == 2 and weight.shape[1] - state[name].shape[1] == place:
-            widest[name] = pad(state[name], (0, place))
-    return widest
 
 
 def copies(cfg: Config) -> bool:

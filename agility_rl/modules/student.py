@@ -20,7 +20,7 @@ from agility_rl.modules.estimator import StateEstimator
 from agility_rl.modules.hybrid_actor import HybridActor
 from agility_rl.modules.mlp import mlp
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
-from agility_rl.modules.teacher import NUM_HEADING, Teacher
+from agility_rl.modules.teacher import NUM_HEADING, Teacher, resize_place
 
 HEADING_SCALE = 1.5
 """Factor on the predicted heading errors (method notes, section 5.9)."""
@@ -127,10 +127,7 @@ class RecurrentStudent(nn.Module):
         student = cls(**settings, **options)
         for name in ("estimator", "history_encoder"):
             getattr(student, name).load_state_dict(getattr(teacher, name).state_dict())
-        weights = teacher.actor.state_dict()
-        first = next(name for name, weight in weights.items() if weight.ndim == 2)
-        weights[first] = weights[first][:, : weights[first].shape[1] - place]  # it is the last input
-        student.actor.load_state_dict(weights)
+        student.actor.load_state_dict(resize_place(teacher.actor.state_dict(), -place))
         return student
 
     def initial_hidden(self, num_robots: int) -> Tensor:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from agility_rl import keys
 from agility_rl.go2 import features
@@ -18,6 +20,26 @@ from agility_rl.modules.scandots import NUM_TERRAIN_LATENT, ScandotsEncoder
 
 NUM_HEADING = 2
 """Heading errors to the current and to the next way-point (method notes, section 5.4)."""
+
+
+def resize_place(weights: Mapping[str, Tensor], change: int) -> dict[str, Tensor]:
+    """Weights with an actor whose last input, ``place``, is larger or smaller by so many numbers.
+
+    New numbers count nothing yet; without them the actor does what it does where they are 0.
+
+    Source: no equation of the paper (ours).
+
+    Args:
+        weights: state dict of a teacher or of its actor.
+        change: numbers to add, or to take away where it is negative.
+
+    Example:
+        >>> first = "trunk.layers.0.weight"
+        >>> resize_place({first: torch.ones(16, 119)}, 8)[first].shape
+        torch.Size([16, 127])
+    """
+    first = next(name for name in weights if name.endswith("trunk.layers.0.weight"))
+    return {**weights, first: pad(weights[first], (0, change))}
 
 
 class Teacher(nn.Module):

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from agility_rl.deploy.artifact import Artifact
+from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.modules import Teacher
 from agility_rl.record.mcap_logger import read_scalars
@@ -76,6 +76,9 @@ def test_a_teacher_learns_to_read_its_place_from_where_it_was(recipe: ModuleType
         moved = parts.teacher.deployable_policy()(seen.clone())["loc"]
     assert not torch.equal(moved, parent.deployable_policy()(seen.clone())["loc"])
     parts.env.close()
+    reader = recipe.train(replace(smoke, name="reader", iterations=1, place=True))
+    with pytest.raises(ArtifactError, match="not those of the expected network"):
+        recipe.train(replace(smoke, name="refused", init_from=reader))
 
 
 def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
