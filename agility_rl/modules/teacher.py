@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
 from torch import Tensor, nn
 from torch.nn.functional import pad
@@ -34,6 +33,7 @@ def resize_place(weights: Mapping[str, Tensor], change: int) -> dict[str, Tensor
         change: numbers to add, or to take away where it is negative.
 
     Example:
+        >>> import torch
         >>> first = "trunk.layers.0.weight"
         >>> resize_place({first: torch.ones(16, 119)}, 8)[first].shape
         torch.Size([16, 127])
