@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from easi_config import PRESETS, Config, CriticConfig, least_std, replay_window
+from easi_config import PRESETS, Config, CriticConfig, least_std, replay_window, replayed_at_once
 from easi_report import (
     draw_convergence,
     identify,
@@ -59,8 +59,6 @@ from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.display import Display
 from agility_rl.training.seeding import Seeds, seed_everything
 
-REPLAYED_AT_ONCE = 5
-"""Windows that every individual plays at the same time; more only takes memory. It does not change the result."""
 HEADLINE = ("time/minutes", "error/mean", "distance", "score/mean", "score/best")
 
 
@@ -119,7 +117,7 @@ def build(cfg: Config) -> Components:
         for name, value in recording.items():
             if recorded.get(name) != value:
                 print(f"warning: the log was recorded with {name} {recorded.get(name)}, the search has {value}")
-    at_once = REPLAYED_AT_ONCE if cfg.collection == "replay" else 1
+    at_once = replayed_at_once(cfg) if cfg.collection == "replay" else 1
     simulator = make_simulator(
         num_simulations=at_once * cfg.num_robots, num_threads=cfg.num_threads, friction_loss=recording["friction_loss"]
     )

@@ -6,6 +6,7 @@ method searches it, and the table compares their errors with the truth. Conditio
     clean     what the sensors say is exact and in time
     noisy     measurement noise of the released code, and measurements one control step late; both known
     outside   as clean, but every gain of the target lies outside the first search range, [1/1.5, 1.5] x nominal
+    outside_noisy   noisy and outside
 
 Source: issue of stage 2; range of the targets and error |x - x*| / x*: method notes, sections 6.3 and 6.5; log of 4,000
 steps: supplement S2.
@@ -59,7 +60,12 @@ class Condition:
     """First range of the search, [1/span, span] x nominal."""
 
 
-CONDITIONS = {"clean": Condition(), "noisy": Condition(noise=1.0, latency=1), "outside": Condition(span=OUTSIDE_SPAN)}
+CONDITIONS = {
+    "clean": Condition(),
+    "noisy": Condition(noise=1.0, latency=1),
+    "outside": Condition(span=OUTSIDE_SPAN),
+    "outside_noisy": Condition(noise=1.0, latency=1, span=OUTSIDE_SPAN),
+}
 
 
 @dataclass(frozen=True)

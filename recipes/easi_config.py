@@ -52,7 +52,8 @@ class CriticConfig:
     difference: bool = False
     """Show the critic s' - s instead of s' (ours)."""
     matched: bool = False
-    """Show the critic s' - s'_R, what the robot did after the same s and a; needs ``--collection replay`` (ours)."""
+    """Show the critic |s' - s'_R|, by how much s' misses what the robot did after the same s and a; needs
+    ``--collection replay`` (ours)."""
     clip: float = 10.0
     """Bound of the critic's normalised inputs; a small one silences windows whose estimated start is far off (ours)."""
     batch_per_robot: int = 16
@@ -133,11 +134,12 @@ SMOKE = replace(
 )
 PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}
 
-REPLAY_WINDOWS = {"exact": (1, 0), "noisy": (5, 1)}
+REPLAY_WINDOWS = {"exact": (1, 0), "noisy": (8, 2)}
 """Steps and skipped steps of a replayed window. With exact start states the first step says most, and later ones only
 add what the estimated trunk velocity gets wrong; a start state that was smoothed out of noise needs some steps to be
 forgotten (measured: docs/easi.md)."""
-
+MOST_AT_ONCE = 6
+"""Most windows that every individual plays at the same time: beyond some hundreds of robots more only takes memory."""
 
 LEAST_STD = {"exact": 0.0, "noisy": 0.02}
 """Least deviation of a search. Windows that are drawn anew shift what noise makes of the best parameters by more than
@@ -155,3 +157,9 @@ def replay_window(cfg: Config) -> tuple[int, int]:
     steps, skip = REPLAY_WINDOWS["noisy" if cfg.noise else "exact"]
     steps = steps if cfg.window is None else cfg.window
     return steps, min(skip, steps - 1) if cfg.skip is None else cfg.skip
+
+
+def replayed_at_once(cfg: Config) -> int:
+    """Windows that every individual plays at the same time, so that no robot idles; they do not change the result."""
+    count = max(cfg.trajectory_length // replay_window(cfg)[0], 1)
+    return max(number for number in range(1, MOST_AT_ONCE + 1) if count % number == 0)

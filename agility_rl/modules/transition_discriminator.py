@@ -29,12 +29,13 @@ class TransitionDiscriminator(TensorDictModuleBase):
     the network sees of it: with ``difference`` the third input is s' - s, scaled by its own, much smaller, spread. The
     two forms carry the same information; at 50 Hz s' alone is nearly s. Where it is known what the robot did after the
     same state and action (:class:`agility_rl.collectors.ReplayCollector`), that is the best origin: with
-    ``matched_key`` the third input is the discrepancy s' - s'_R, 0 for the robot, and :meth:`rescale` keeps it in view
-    while the simulator comes closer.
+    ``matched_key`` the third input is the discrepancy \|s' - s'_R\|, 0 for the robot, and :meth:`rescale` keeps it in
+    view while the simulator comes closer. Its sign is left out, because a miss is one to either side: with it, a
+    population that misses to one side teaches the network a slope that goes on rising beyond the robot.
 
     .. math:: \tilde D(s, a, s') = \mathrm{MLP}(\mathrm{norm}([s, a, s'])) \quad\text{or}\quad
               \mathrm{MLP}(\mathrm{norm}([s, a, s' - s])) \quad\text{or}\quad
-              \mathrm{MLP}(\mathrm{norm}([s, a, s' - s'_R]))
+              \mathrm{MLP}(\mathrm{norm}([s, a, |s' - s'_R|]))
 
     Source: Algorithm S2, D-tilde of Eq. (13); sizes 128-128 with ReLU: EASI's release (method notes, section 6.2).
     Differs from it: inputs are normalised by fixed statistics of the log, because radians and rad/s differ by a factor
@@ -55,8 +56,8 @@ class TransitionDiscriminator(TensorDictModuleBase):
         hidden: sizes of the hidden layers.
         normalizer: scales the ``2 S + A`` inputs; ``None`` takes them as they are.
         difference: give the network s' - s instead of s'; the normaliser's statistics are then of s' - s as well.
-        matched_key: key of what the robot measured after the same state and action; the third input is then s' minus
-            that.
+        matched_key: key of what the robot measured after the same state and action; the third input is then by how
+            much s' misses that.
         measurement_key: key of the state; the following state stands under ``("next", measurement_key)``.
         action_key: key of the action.
         out_key: key of the logit.
@@ -140,8 +141,11 @@ class TransitionDiscriminator(TensorDictModuleBase):
             if value.shape[-1] != size:
                 raise ValueError(f"{key!r} must be [*B, {size}], got {list(value.shape)}")
         state, action, following, *matched = inputs
-        origin = matched[0] if matched else state if self.difference else None
-        return torch.cat((state, action, following if origin is None else following - origin), -1)
+        if matched:
+            following = (following - matched[0]).abs()
+        elif self.difference:
+            following = following - state
+        return torch.cat((state, action, following), -1)
 
     @torch.no_grad()
     def rescale(self, transitions: TensorDictBase) -> None:
@@ -166,7 +170,7 @@ class TransitionDiscriminator(TensorDictModuleBase):
         discrepancy = discrepancy.flatten(0, -2) if mask is None else discrepancy[mask]
         if not len(discrepancy):
             raise ValueError("no transition is valid; look at the parameters and the start states")
-        scale = discrepancy.abs().median(0).values.clamp_min(TINY_DISCREPANCY)
+        scale = discrepancy.median(0).values.clamp_min(TINY_DISCREPANCY)
         self.normalizer.std[-size:] = scale.to(self.normalizer.std.dtype)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

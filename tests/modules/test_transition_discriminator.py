@@ -106,15 +106,18 @@ def matched(count: int, scale: Tensor) -> TensorDict:
     return td
 
 
-def test_the_discrepancy_from_the_robot_against_numpy() -> None:
+def test_the_discrepancy_from_the_robot_against_numpy_has_no_sign() -> None:
     network = TransitionDiscriminator(S, A, (7, 6), matched_key=MATCHED)
     td = matched(5, torch.ones(S))
     state, action, after, robot = (
         td[key].double().numpy() for key in ("measurement", "action", ("next", "measurement"), MATCHED)
     )
-    expected = by_hand(network, np.concatenate((state, action, after - robot), -1))
+    expected = by_hand(network, np.concatenate((state, action, abs(after - robot)), -1))
     np.testing.assert_allclose(network(td)["transition_logit"].detach().numpy(), expected, rtol=1e-4, atol=1e-6)
     assert network.in_keys[-1] == MATCHED
+    other = td.clone()
+    other["next", "measurement"] = 2.0 * td[MATCHED] - td["next", "measurement"]  # as far off to the other side
+    torch.testing.assert_close(network(other)["transition_logit"], network(td)["transition_logit"])
 
 
 def test_the_discrepancy_is_scaled_by_its_median_and_clipped() -> None:

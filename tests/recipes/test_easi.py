@@ -148,14 +148,16 @@ def test_a_noisy_log_takes_longer_windows_and_a_wide_search(easi: ModuleType, lo
         easi.replay_window(replace(cpu, **options))
         for options in ({}, {"noise": 1.0, "latency": 1}, {"latency": 1}, {"window": 8}, {"noise": 1.0, "window": 1})
     ]
-    assert known == [(1, 0), (5, 1), (1, 0), (8, 0), (1, 0)]
+    assert known == [(1, 0), (8, 2), (1, 0), (8, 0), (1, 0)]
+    at_once = [easi.replayed_at_once(cfg) for cfg in (cpu, replace(cpu, noise=1.0), replace(cpu, trajectory_length=7))]
+    assert at_once == [5, 6, 1], "of 100, 12 and 7 windows: divisors, so that no robot idles"
     paper, settled = easi.PRESETS["paper"], replace(cpu.search, min_std=0.0)
     searches = (cpu, replace(cpu, noise=1.0), replace(cpu, noise=1.0, search=settled), replace(paper, noise=1.0))
     assert [easi.least_std(cfg) for cfg in searches] == [0.0, 0.02, 0.0, 0.0]
-    for noise, count, length in ((0.0, 20, 1), (1.0, 4, 4)):
+    for noise, count, length, counted in ((0.0, 20, 1, 1), (1.0, 2, 8, 6)):
         parts = easi.build(smoke(easi, log, tmp_path, noise=noise))
-        assert parts.collector.num_steps == 20 and parts.search.min_std == (0.02 if noise else 0.0)
-        assert parts.collector.collect(parts.search.ask()).shape == (8, count * length)
+        assert parts.collector.num_steps == count * length and parts.search.min_std == (0.02 if noise else 0.0)
+        assert parts.collector.collect(parts.search.ask()).shape == (8, count * counted)
         parts.simulator.close()
 
 

@@ -94,7 +94,7 @@ def test_the_baselines_see_the_windows_of_the_search(module: Module, log: RobotL
     baselines, path = module("easi_baselines"), log.save(tmp_path / "log.npz")
     for name, noise, given, expected in (
         ("clean", 0.0, {}, (1, 0)),
-        ("noisy", 1.0, {}, (5, 1)),
+        ("noisy", 1.0, {}, (8, 2)),
         ("clean", 0.0, {"window": 10, "skip": 3}, (10, 3)),
     ):
         condition = replace(baselines.CONDITIONS[name], latency=0)
@@ -210,8 +210,8 @@ def test_a_method_that_is_missing_is_run_alone_on_the_same_log(baselines: Module
 def test_targets_are_the_same_in_all_conditions_but_outside(baselines: ModuleType) -> None:
     conditions = baselines.CONDITIONS
     for index in range(20):
-        clean, noisy, outside = (baselines.draw_target(0, index, conditions[n]) for n in ("clean", "noisy", "outside"))
-        assert clean == noisy and tuple(clean) == GAINS
+        clean, noisy, outside, late = (baselines.draw_target(0, index, drawn) for drawn in conditions.values())
+        assert clean == noisy and outside == late and tuple(clean) == GAINS
         assert all(1 / 3 <= multiple <= 3 for multiple in clean.values())
         assert all(1 / 3 <= multiple < 1 / 1.5 or 1.5 < multiple <= 3 for multiple in outside.values())
         assert baselines.draw_target(1, index, conditions["clean"]) != clean
@@ -268,7 +268,7 @@ def test_methods_are_compared_target_by_target(module: Module) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--conditions", "foggy"), "expected --conditions from clean, noisy, outside, got foggy"),
+        (("--conditions", "foggy"), "expected --conditions from clean, noisy, outside, outside_noisy, got foggy"),
         (
             ("--methods", "easi", "guess"),
             "expected --methods from easi, cma_es, cma_es_robust, sysid, uniform, got guess",
