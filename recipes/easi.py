@@ -16,14 +16,13 @@ Presets: ``smoke`` (seconds), ``cpu`` (two cores, ours), ``paper`` (Table S3).
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from easi_config import PRESETS, Config, CriticConfig, least_std, replay_window, replayed_at_once
+from easi_config import PRESETS, Config, CriticConfig, check, check_inputs, least_std, replay_window, replayed_at_once
 from easi_report import (
     draw_convergence,
     identify,
@@ -44,6 +43,7 @@ from agility_rl.collectors import (
     EvolutionStrategy,
     ParameterSpace,
     ReplayCollector,
+    ResponseMemory,
     RobotLog,
     cut_windows,
     one_thread,
@@ -72,6 +72,7 @@ class Components:
     search: EvolutionStrategy
     simulator: Simulator
     collector: EASICollector | ReplayCollector
+    responses: ResponseMemory | None
     critic: TransitionDiscriminator
     loss: TransitionDiscriminatorLoss
     optimizer: torch.optim.Optimizer
@@ -83,23 +84,17 @@ class Components:
 
     def checkpoint(self, folder: Path, progress: dict[str, float]) -> RunCheckpoint:
         """All that a bit-exact continuation needs; a collection begins with a reset, so no simulator is saved."""
-        names = ("seeds", "search", "critic", "optimizer", "survivors")
-        return RunCheckpoint(folder, progress=progress, **{name: getattr(self, name) for name in names})
+        names = ("seeds", "search", "responses", "critic", "optimizer", "survivors")
+        parts = {name: part for name in names if (part := getattr(self, name)) is not None}
+        return RunCheckpoint(folder, progress=progress, **parts)
 
 
 @one_thread()
 def build(cfg: Config) -> Components:
     """Read the log, construct simulations, search and critic."""
-    if cfg.log is None:
-        raise ValueError("give --log FILE, a robot log in .mcap, .csv or .npz; record_log.py makes one")
-    if cfg.critic.matched and cfg.collection != "replay":
-        raise ValueError(
-            "--critic.matched needs --collection replay: a roll-out of the policy has no matching transition"
-        )
-    if cfg.generations < 1 or cfg.trajectory_length < 1 or cfg.noise < 0.0 or cfg.critic.updates < 1:
-        raise ValueError("expected --generations, --trajectory-length and --critic.updates from 1, and --noise from 0")
+    path = check(cfg)
     seeds, search = seed_everything(cfg.seed), cfg.search
-    log = RobotLog.load(cfg.log)
+    log = RobotLog.load(path)
     linear = {"scale": "linear"} if search.scale == "linear" else {}
     space = ParameterSpace([Parameter.named(name, span=search.span, **linear) for name in search.parameters])
     actor = make_actor(cfg.policy, cfg.behaviours, cfg.command_seconds)
@@ -150,18 +145,20 @@ def build(cfg: Config) -> Components:
             covariance=search.covariance,
             centre=search.centre,
             min_std=least_std(cfg),
+            averaged=search.averaged,
             lower=lower,
             upper=upper,
             generator=seeds.generator("search"),
         ),
         simulator=simulator,
         collector=collector,
+        responses=None if search.response is None else ResponseMemory(share=search.response),
         critic=critic,
         loss=loss,
         optimizer=optimizer,
         survivors=torch.zeros(len(space), len(space), dtype=torch.float64),
         truth=truth,
-        inputs={"log": checksum(cfg.log), **recording},
+        inputs={"log": checksum(path), **recording},
     )
 
 
@@ -218,7 +215,7 @@ def evolve(parts: Components, cfg: Config) -> dict[str, float]:
     collected = time.perf_counter()
     metrics: dict[str, Any] = update_critic(parts, cfg.critic, transitions)
     scores = parts.collector.score(parts.critic, transitions)
-    parts.search.tell(individuals, scores)
+    parts.search.tell(individuals, scores, next_mean(parts, individuals, transitions))
     with one_thread():
         parts.survivors += survivor_correlation(parts.search, individuals, scores)
     metrics |= {"score/mean": scores[scores.isfinite()].mean(), "score/best": scores.max()}
@@ -234,6 +231,15 @@ def evolve(parts: Components, cfg: Config) -> dict[str, float]:
     metrics["unusable_transitions"] = (~transitions["collector", "mask"]).float().mean()
     metrics |= {"time/collect": collected - clock, "time/critic": time.perf_counter() - collected}
     return {name: float(value) for name, value in metrics.items()}
+
+
+def next_mean(parts: Components, individuals: Tensor, transitions: TensorDictBase) -> Tensor | None:
+    """Where the critic likes the windows' linear responses best; the survivors' mean (``None``) without any."""
+    if parts.responses is None:
+        return None
+    parts.responses.remember(individuals, transitions, parts.search.mean)
+    # The first generation fills the whole range, and in that nothing is linear.
+    return parts.responses.climb(parts.critic, parts.search) if parts.search.generation else None
 
 
 def train(cfg: Config, console: Console | None = None) -> Path:
@@ -277,18 +283,6 @@ def train(cfg: Config, console: Console | None = None) -> Path:
         draw_convergence(folder / "figures" / "convergence.png", read_scalars(folder), parts.space, parts.truth)
     console.print(f"saved {folder}", markup=False)
     return folder
-
-
-def check_inputs(run: Path, inputs: dict[str, Any]) -> None:
-    """Refuse to go on with another log or policy than a run began with.
-
-    Raises:
-        ValueError: naming what changed.
-    """
-    began = json.loads((run / cli.CONFIG_FILE).read_text(encoding="utf-8")).get("inputs", {})
-    for name, value in inputs.items():
-        if began.get(name) != value:
-            raise ValueError(f"{run} began with {name} {began.get(name)}, found {value}; resume with the same one")
 
 
 if __name__ == "__main__":

@@ -7,11 +7,14 @@ sees by how much they miss it.
 
 from __future__ import annotations
 
+import json
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from agility_rl.collectors import GAINS
+from agility_rl.training import cli
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,13 @@ class SearchConfig:
     centre: Literal["new", "old"] = "new"
     """Mean about which the spread is taken; ``new`` as in EASI's release, ``old`` reaches far outside the range."""
     min_std: float | None = 0.0
-    """Least standard deviation in shares of the first range; 0 as in EASI's release. When None, 0 for an exact log and
-    0.02 for a noisy one."""
+    """Least standard deviation in shares of the first range; 0 as in EASI's release. When None, 0.005 of [1/3, 3] x
+    nominal for an exact log and 0.02 for a noisy one."""
+    averaged: float = 0.0
+    """Share of the generations whose means the result averages; 0 as in EASI's release."""
+    response: float | None = None
+    """Share of the generations in whose windows the critic looks for the next mean, by linear responses; needs
+    ``--collection replay`` (ours). When None, the mean of the survivors, as in EASI's release."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +60,8 @@ class CriticConfig:
     difference: bool = False
     """Show the critic s' - s instead of s' (ours)."""
     matched: bool = False
-    """Show the critic |s' - s'_R|, by how much s' misses what the robot did after the same s and a; needs
-    ``--collection replay`` (ours)."""
+    """Show the critic |s' - s'_R|, by how much s' misses what the robot did after the same s and a, and let it begin as
+    a distance; needs ``--collection replay`` (ours)."""
     clip: float = 10.0
     """Bound of the critic's normalised inputs; a small one silences windows whose estimated start is far off (ours)."""
     batch_per_robot: int = 16
@@ -85,9 +93,9 @@ class Config:
     collection: Literal["policy", "replay"] = "policy"
     """``policy``: individuals roll out the policy (Algorithm S2); ``replay``: windows of the log (ours)."""
     window: int | None = None
-    """Control steps of a replayed window; when not given, 1 for an exact log and 5 for a noisy one."""
+    """Control steps of a replayed window; when not given, 1 for an exact log and 8 for a noisy one."""
     skip: int | None = None
-    """First steps of a window that do not count; when not given, 0 for an exact log and 1 for a noisy one."""
+    """First steps of a window that do not count; when not given, 0 for an exact log and 2 for a noisy one."""
     noise: float = 0.0
     """Measurement noise that the robot is known to have, as in ``record_log.py``."""
     latency: int = 0
@@ -109,10 +117,10 @@ class Config:
 PAPER = Config(search=SearchConfig(scale="linear", bounded=True))
 CPU = Config(
     generations=25,
-    num_robots=150,
-    trajectory_length=100,
+    num_robots=100,
+    trajectory_length=150,
     collection="replay",
-    search=SearchConfig(covariance="full", centre="old", min_std=None),
+    search=SearchConfig(covariance="full", centre="old", min_std=None, averaged=0.3, response=0.75),
     critic=CriticConfig(
         optimizer="adam",
         learning_rate=1e-3,
@@ -120,7 +128,7 @@ CPU = Config(
         gradient_penalty=1.0,
         matched=True,
         clip=3.0,
-        batch_per_robot=8,
+        batch_per_robot=4,
     ),
 )
 SMOKE = replace(
@@ -141,15 +149,16 @@ forgotten (measured: docs/easi.md)."""
 MOST_AT_ONCE = 6
 """Most windows that every individual plays at the same time: beyond some hundreds of robots more only takes memory."""
 
-LEAST_STD = {"exact": 0.0, "noisy": 0.02}
-"""Least deviation of a search. Windows that are drawn anew shift what noise makes of the best parameters by more than
-a search that settles is wide; one that stays wide averages over them (measured: docs/easi.md)."""
+LEAST_STD = {"exact": 0.005, "noisy": 0.02}
+"""Least deviation of a search, in shares of [1/3, 3] x nominal: about what a result is off, so that the distribution
+holds the truth (measured: docs/easi.md)."""
 
 
 def least_std(cfg: Config) -> float:
-    """Least standard deviation of the search, a given one before the usual one."""
-    given = cfg.search.min_std
-    return LEAST_STD["noisy" if cfg.noise else "exact"] if given is None else given
+    """Least standard deviation of the search, a given one before the usual one, which no first range changes."""
+    if cfg.search.min_std is not None:
+        return cfg.search.min_std
+    return LEAST_STD["noisy" if cfg.noise else "exact"] * math.log(SearchConfig.span) / math.log(cfg.search.span)
 
 
 def replay_window(cfg: Config) -> tuple[int, int]:
@@ -163,3 +172,33 @@ def replayed_at_once(cfg: Config) -> int:
     """Windows that every individual plays at the same time, so that no robot idles; they do not change the result."""
     count = max(cfg.trajectory_length // replay_window(cfg)[0], 1)
     return max(number for number in range(1, MOST_AT_ONCE + 1) if count % number == 0)
+
+
+def check(cfg: Config) -> Path:
+    """Refuse options that make no search; returns the log's path.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    if cfg.log is None:
+        raise ValueError("give --log FILE, a robot log in .mcap, .csv or .npz; record_log.py makes one")
+    for option, value in (("critic.matched", cfg.critic.matched), ("search.response", cfg.search.response)):
+        if value and cfg.collection != "replay":
+            raise ValueError(
+                f"--{option} needs --collection replay: a roll-out of the policy has no matching transition"
+            )
+    if cfg.generations < 1 or cfg.trajectory_length < 1 or cfg.noise < 0.0 or cfg.critic.updates < 1:
+        raise ValueError("expected --generations, --trajectory-length and --critic.updates from 1, and --noise from 0")
+    return cfg.log
+
+
+def check_inputs(run: Path, inputs: dict[str, Any]) -> None:
+    """Refuse to go on with another log or policy than a run began with.
+
+    Raises:
+        ValueError: naming what changed.
+    """
+    began = json.loads((run / cli.CONFIG_FILE).read_text(encoding="utf-8")).get("inputs", {})
+    for name, value in inputs.items():
+        if began.get(name) != value:
+            raise ValueError(f"{run} began with {name} {began.get(name)}, found {value}; resume with the same one")

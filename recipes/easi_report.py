@@ -92,9 +92,10 @@ def identify(search: EvolutionStrategy, space: ParameterSpace, survivors: Tensor
                     f"{rule} more than either"
                 )
         bounded = bool(search.lower[i] == search.low[i] and search.upper[i] == search.high[i])
-        if bounded and not EDGE <= (search.mean[i] - search.low[i]) / (search.high[i] - search.low[i]) <= 1.0 - EDGE:
+        place = (search.estimate[i] - search.low[i]) / (search.high[i] - search.low[i])
+        if bounded and not EDGE <= place <= 1.0 - EDGE:
             warnings.append(
-                f"{names[i]}: ends at the edge of its range; widen --search.span or give --no-search.bounded"
+                f"{names[i]}: ends at the edge of its range; widen --search.span or give --search.no-bounded"
             )
     return Identifiability(spread, chance, correlation, tuple(warnings))
 
@@ -104,8 +105,8 @@ def physical(search: EvolutionStrategy, space: ParameterSpace) -> tuple[Tensor, 
 
     The centre of a logarithmic parameter is its median; the spread is half the width of one deviation to either side.
     """
-    ends = [space.denormalize(search.mean + sign * search.std) for sign in (-1.0, 1.0)]
-    return space.denormalize(search.mean), (ends[1] - ends[0]) / 2
+    ends = [space.denormalize(search.estimate + sign * search.std) for sign in (-1.0, 1.0)]
+    return space.denormalize(search.estimate), (ends[1] - ends[0]) / 2
 
 
 def relative_error(value: Tensor, truth: Tensor, space: ParameterSpace) -> Tensor:
@@ -169,7 +170,7 @@ def write_result(
         "model": model,
         # What a later stage draws simulators from: a Gaussian in these coordinates, mapped by these ranges.
         "search": {
-            "mean": search.mean.tolist(),
+            "mean": search.estimate.tolist(),
             "covariance": search.covariance.tolist(),
             "ranges": {p.name: {"low": p.low, "high": p.high, "scale": p.scale} for p in space.parameters},
         },

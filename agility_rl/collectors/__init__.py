@@ -10,6 +10,7 @@ from agility_rl.collectors.log_formats import RobotLogError
 from agility_rl.collectors.log_recording import RobotLogRecorder, record_robot_log
 from agility_rl.collectors.parameters import GAINS, Parameter, ParameterSpace
 from agility_rl.collectors.replay import ReplayCollector
+from agility_rl.collectors.response import ResponseMemory
 from agility_rl.collectors.robot_log import RobotLog
 from agility_rl.collectors.rollout import fallen, roll_out, standing_states
 from agility_rl.collectors.sensors import RobotSensors
@@ -24,6 +25,7 @@ __all__ = [
     "Parameter",
     "ParameterSpace",
     "ReplayCollector",
+    "ResponseMemory",
     "RobotLog",
     "RobotLogError",
     "RobotLogRecorder",

@@ -25,7 +25,7 @@ class EvolutionStrategy:
 
     Source: Table S3 (300 individuals, survival rate 0.5), Algorithm S2; weights, variance about the new mean and
     clipping at the bounds: EASI's release (method notes, section 6.3). Not in the paper: full covariance, the old mean
-    as centre, learning rate, least deviation.
+    as centre, learning rate, least deviation, averaging.
 
     Args:
         low: ``[D]``, lower ends of the first generation.
@@ -36,14 +36,16 @@ class EvolutionStrategy:
         centre: ``"new"`` (paper) or ``"old"`` mean, about which the spread is taken.
         learning_rate: share of the new mean and covariance in the next distribution, in (0, 1]; 1 as in the paper.
         min_std: least standard deviation of every coordinate, 0 as in the paper; keeps a search alive.
+        averaged: share of the generations, counted from the last, whose means :attr:`estimate` averages; with noisy
+            scores that is nearer than the last mean alone (Polyak and Juditsky 1992). 0 as in the paper.
         lower: ``[D]``, individuals are clipped to these; ``None`` for no bound. May lie below ``low``.
         upper: ``[D]``, the same from above.
         generator: source of randomness; the state dict includes it.
 
     Attributes:
-        mean: float64 ``[D]``.
+        mean: float64 ``[D]``, about which individuals are drawn.
+        means: float64 ``[generation, D]``, all of them.
         covariance: float64 ``[D, D]``.
-        generation: how often :meth:`tell` was called.
 
     Raises:
         ValueError: if lengths differ, ranges are empty, the first range leaves the bounds, or an option is out of
@@ -70,6 +72,7 @@ class EvolutionStrategy:
         centre: Literal["new", "old"] = "new",
         learning_rate: float = 1.0,
         min_std: float = 0.0,
+        averaged: float = 0.0,
         lower: Tensor | Sequence[float] | None = None,
         upper: Tensor | Sequence[float] | None = None,
         generator: torch.Generator,
@@ -89,19 +92,40 @@ class EvolutionStrategy:
             raise ValueError(f"expected 'diagonal' or 'full' and 'new' or 'old', got {covariance!r} and {centre!r}")
         if not 0.0 < learning_rate <= 1.0 or min_std < 0.0:
             raise ValueError(f"expected 0 < learning_rate <= 1 and min_std >= 0, got {learning_rate} and {min_std}")
+        if not 0.0 <= averaged <= 1.0:
+            raise ValueError(f"expected averaged, a share of the generations, from 0 to 1, got {averaged}")
         survivors = round(population * survival_rate)
         if not 2 <= survivors <= population:
             raise ValueError(
                 f"population * survival_rate must leave 2 to {population} survivors, got {population} * {survival_rate}"
             )
         self.population, self.form, self.centre = population, covariance, centre
-        self.learning_rate, self.min_std, self.generator = learning_rate, min_std, generator
+        self.learning_rate, self.min_std, self.averaged, self.generator = learning_rate, min_std, averaged, generator
         rank = torch.arange(1, survivors + 1, dtype=torch.float64)
         weights = math.log(survivors + 0.5) - rank.log()
         self.weights = weights / weights.sum()
         self.mean = (self.low + self.high) / 2
         self.covariance = torch.diag((self.high - self.low).square() / 12)  # of the uniform distribution
-        self.generation = 0
+        self.means = torch.empty(0, len(self.low), dtype=torch.float64)
+
+    @property
+    def generation(self) -> int:
+        """How often :meth:`tell` was called."""
+        return len(self.means)
+
+    @property
+    def estimate(self) -> Tensor:
+        """What the search has found so far, ``[D]``: the average of the last means, or the last one."""
+        last = max(round(self.averaged * self.generation), 1)
+        return self.means[-last:].mean(0) if self.generation else self.mean
+
+    @property
+    def root(self) -> Tensor:
+        """Square root ``[D, D]`` of the covariance; by eigenvalues, because one of few survivors may be singular."""
+        if self.form == "diagonal":
+            return torch.diag(self.std)
+        values, vectors = torch.linalg.eigh(self.covariance)
+        return vectors * values.clamp_min(0.0).sqrt()
 
     @property
     def std(self) -> Tensor:
@@ -126,21 +150,17 @@ class EvolutionStrategy:
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
         """Draw from the present Gaussian within the bounds, float64 ``[count, D]``: for use after the search."""
         normal = torch.randn((count, len(self.mean)), generator=generator, dtype=torch.float64)
-        if self.form == "diagonal":
-            deviation = normal * self.std
-        else:
-            # an eigendecomposition, where Cholesky would fail, because a covariance of survivors may be singular
-            values, vectors = torch.linalg.eigh(self.covariance)
-            root = vectors * values.clamp_min(0.0).sqrt()
-            deviation = (normal[:, None, :] * root).sum(-1)
+        deviation = (normal[:, None, :] * self.root).sum(-1)
         return (self.mean + deviation).clamp(self.lower, self.upper)
 
-    def tell(self, individuals: Tensor, scores: Tensor) -> None:
+    def tell(self, individuals: Tensor, scores: Tensor, mean: Tensor | None = None) -> None:
         """Move the distribution towards the individuals of high score.
 
         Args:
             individuals: ``[N, D]``, what :meth:`ask` returned.
             scores: ``[N]`` or ``[N, 1]``, higher is better; who has none that is finite does not survive.
+            mean: ``[D]``, next mean, where a better one than the survivors' is known
+                (:class:`agility_rl.collectors.ResponseMemory`); their spread is the next one in any case.
 
         Raises:
             ValueError: if a shape differs, an individual is not finite, or no score is finite.
@@ -161,24 +181,24 @@ class EvolutionStrategy:
         weights = self.weights * finite[order]
         weights = (weights / weights.sum())[:, None]
         best = individuals[order]
-        mean = (weights * best).sum(0)
-        deviation = best - (mean if self.centre == "new" else self.mean)
+        survivors = (weights * best).sum(0)
+        deviation = best - (survivors if self.centre == "new" else self.mean)
         if self.form == "diagonal":
             covariance = torch.diag((weights * deviation.square()).sum(0))
         else:
             covariance = (weights[..., None] * deviation[:, :, None] * deviation[:, None, :]).sum(0)
-        self.mean = torch.lerp(self.mean, mean, self.learning_rate)
+        self.mean = torch.lerp(self.mean, survivors, self.learning_rate) if mean is None else mean.double()
+        self.mean = self.mean.clamp(self.lower, self.upper)
         self.covariance = torch.lerp(self.covariance, covariance, self.learning_rate)
         variance = self.covariance.diagonal()
         variance.copy_(variance.clamp_min(self.min_std**2))  # a view: larger diagonals keep the matrix positive
-        self.generation += 1
+        self.means = torch.cat((self.means, self.mean[None]))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact continuation needs."""
         return {
-            "mean": self.mean.clone(),
             "covariance": self.covariance.clone(),
-            "generation": self.generation,
+            "means": self.means.clone(),
             "generator": self.generator.get_state(),
         }
 
@@ -188,10 +208,10 @@ class EvolutionStrategy:
         Raises:
             ValueError: if the state has another number of parameters.
         """
-        if state["mean"].shape != self.mean.shape:
-            raise ValueError(f"the state has {len(state['mean'])} parameters, expected {len(self.mean)}")
-        self.mean, self.covariance = state["mean"].clone(), state["covariance"].clone()
-        self.generation = int(state["generation"])
+        if state["covariance"].shape != self.covariance.shape:
+            raise ValueError(f"the state has {len(state['covariance'])} parameters, expected {len(self.mean)}")
+        self.means, self.covariance = state["means"].clone(), state["covariance"].clone()
+        self.mean = self.means[-1].clone() if len(self.means) else (self.low + self.high) / 2
         self.generator.set_state(state["generator"])
 
 

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from agility_rl.collectors.easi import one_thread
 from agility_rl.collectors.robot_log import MIN_STEPS, RobotLog
 from agility_rl.collectors.rollout import MeasuredPolicy, roll_out
 from agility_rl.collectors.sensors import RobotSensors
@@ -58,7 +59,8 @@ def record_robot_log(
         (100, torch.Size([100, 12]))
     """
     sensors = RobotSensors(simulator.num_simulations, noise=noise, latency=latency, generator=generator)
-    with torch.no_grad():
+    # On one thread: a closed loop magnifies the last bit, and a single robot's networks are too small for two.
+    with torch.no_grad(), one_thread():
         rollout = roll_out(simulator, policy, num_steps, sensors=sensors, generator=generator, start=start)
     return RobotLog.from_rollout(rollout, row, control_dt=simulator.control_dt, name="simulated log")
 

@@ -21,6 +21,10 @@ NORMALIZED_TRANSITION = "normalized_transition"
 TINY_DISCREPANCY = 1e-6
 """Least scale of a discrepancy [SI units]: differences below are rounding."""
 
+DISCREPANCY_SLOPE = 0.25
+"""Fall of the logit per median of discrepancy m = |s' - s'_R|. With a critic -w m, Eq. (13) with a penalty of 1 is
+-w E[m] / 2 + w^2, least at w = E[m] / 4; and in medians E[m] is about 1."""
+
 
 class TransitionDiscriminator(TensorDictModuleBase):
     r"""Judge transitions: :math:`\tilde D(s, a, s')`, high for the robot, low for the simulator.
@@ -31,11 +35,14 @@ class TransitionDiscriminator(TensorDictModuleBase):
     same state and action (:class:`agility_rl.collectors.ReplayCollector`), that is the best origin: with
     ``matched_key`` the third input is the discrepancy \|s' - s'_R\|, 0 for the robot, and :meth:`rescale` keeps it in
     view while the simulator comes closer. Its sign is left out, because a miss is one to either side: with it, a
-    population that misses to one side teaches the network a slope that goes on rising beyond the robot.
+    population that misses to one side teaches the network a slope that goes on rising beyond the robot. That less of it
+    is better need not be learned either: the logit falls with it from the beginning, and the network, whose last layer
+    begins at 0, learns what is different from that.
 
     .. math:: \tilde D(s, a, s') = \mathrm{MLP}(\mathrm{norm}([s, a, s'])) \quad\text{or}\quad
               \mathrm{MLP}(\mathrm{norm}([s, a, s' - s])) \quad\text{or}\quad
-              \mathrm{MLP}(\mathrm{norm}([s, a, |s' - s'_R|]))
+              \mathrm{MLP}(\mathrm{norm}([s, a, m])) - \tfrac14 \sum_i \mathrm{norm}(m)_i,
+              \quad m = |s' - s'_R|
 
     Source: Algorithm S2, D-tilde of Eq. (13); sizes 128-128 with ReLU: EASI's release (method notes, section 6.2).
     Differs from it: inputs are normalised by fixed statistics of the log, because radians and rad/s differ by a factor
@@ -102,14 +109,16 @@ class TransitionDiscriminator(TensorDictModuleBase):
             )
         if difference and matched_key is not None:
             raise ValueError("give difference or matched_key: s' is relative to one state, not to two")
-        matched = [] if matched_key is None else [matched_key]
-        self.sizes = (num_measurements, num_actions, num_measurements, *(num_measurements for _ in matched))
-        self.difference = difference
+        robot = [] if matched_key is None else [matched_key]
+        self.sizes = (num_measurements, num_actions, num_measurements, *(num_measurements for _ in robot))
+        self.difference, self.matched = difference, bool(robot)
         self.normalizer = normalizer
         self.layers = mlp(size, hidden, activation=nn.ReLU)
         self.head = nn.Linear(hidden[-1], 1)
         nn.init.zeros_(self.head.bias)
-        self.in_keys = [measurement_key, action_key, _following(measurement_key), *matched]
+        if self.matched:
+            nn.init.zeros_(self.head.weight)
+        self.in_keys = [measurement_key, action_key, _following(measurement_key), *robot]
         self.out_keys = [out_key, normalized_key]
 
     @classmethod
@@ -140,9 +149,9 @@ class TransitionDiscriminator(TensorDictModuleBase):
         for key, value, size in zip(self.in_keys, inputs, self.sizes):
             if value.shape[-1] != size:
                 raise ValueError(f"{key!r} must be [*B, {size}], got {list(value.shape)}")
-        state, action, following, *matched = inputs
-        if matched:
-            following = (following - matched[0]).abs()
+        state, action, following, *robot = inputs
+        if robot:
+            following = (following - robot[0]).abs()
         elif self.difference:
             following = following - state
         return torch.cat((state, action, following), -1)
@@ -161,7 +170,7 @@ class TransitionDiscriminator(TensorDictModuleBase):
             ValueError: if the network sees no discrepancy, has no normaliser, or no transition counts.
         """
         size = self.sizes[2]
-        if len(self.sizes) < 4 or self.normalizer is None:
+        if not self.matched or self.normalizer is None:
             raise ValueError(
                 "rescale needs a matched_key and a normaliser; build with from_transitions(matched_key=...)"
             )
@@ -177,7 +186,10 @@ class TransitionDiscriminator(TensorDictModuleBase):
         """Write the logit and the normalised inputs."""
         inputs = self.assemble(tensordict)
         normalized = inputs if self.normalizer is None else self.normalizer(inputs)
-        tensordict.set(self.out_keys[0], self.head(self.layers(normalized)))
+        logit = self.head(self.layers(normalized))
+        if self.matched:
+            logit = logit - DISCREPANCY_SLOPE * normalized[..., -self.sizes[2] :].sum(-1, keepdim=True)
+        tensordict.set(self.out_keys[0], logit)
         tensordict.set(self.out_keys[1], normalized)
         return tensordict
 

@@ -142,6 +142,48 @@ def test_correlation_of_what_the_score_cannot_tell_apart() -> None:
     assert es.correlation[0, 2].abs() < 0.5
 
 
+def test_the_estimate_averages_the_last_means() -> None:
+    es, plain = strategy(averaged=0.5, covariance="full"), strategy(covariance="full")
+    assert es.estimate.tolist() == [0.5, 0.5]
+    means = []
+    for _ in range(5):
+        for one in (es, plain):
+            x = one.ask()
+            one.tell(x, -(x - 0.3).square().sum(-1))
+        means.append(es.mean.numpy())
+    assert torch.equal(es.mean, plain.mean), "averaging does not change the search"
+    np.testing.assert_allclose(es.estimate.numpy(), np.mean(means[-2:], 0))  # round(2.5) is 2
+    assert torch.equal(plain.estimate, plain.mean)
+    other = strategy(averaged=0.5, seed=7, covariance="full")
+    other.load_state_dict(es.state_dict())
+    assert torch.equal(other.estimate, es.estimate) and torch.equal(other.ask(), es.ask())
+
+
+def test_averaging_is_nearer_when_scores_are_noisy() -> None:
+    generator, misses = torch.Generator().manual_seed(3), {0.0: 0.0, 0.5: 0.0}
+    for seed in range(8):
+        es = strategy(3, 40, seed=seed, min_std=0.1)
+        for _ in range(30):
+            x, best = es.ask(), 0.4 + 0.2 * torch.randn(3, generator=generator)
+            es.tell(x, -(x - best).square().sum(-1))
+        for share in misses:
+            es.averaged = share
+            misses[share] += (es.estimate - 0.4).norm().item()
+    assert misses[0.5] < 0.7 * misses[0.0]
+
+
+def test_a_known_mean_replaces_that_of_the_survivors() -> None:
+    one, other = strategy(), strategy()
+    x, scores = one.ask(), torch.randn(20)
+    one.tell(x, scores)
+    other.tell(x, scores, torch.tensor([0.1, 0.9]))
+    assert other.mean.tolist() == pytest.approx([0.1, 0.9])
+    assert torch.equal(one.covariance, other.covariance)
+    bounded = strategy(lower=[0.0, 0.0], upper=[1.0, 1.0])
+    bounded.tell(x, scores, torch.tensor([-3.0, 0.9]))
+    assert bounded.mean.tolist() == pytest.approx([0.0, 0.9])
+
+
 def test_least_deviation() -> None:
     es = strategy(2, 20, min_std=0.05, covariance="full")
     search(es, torch.tensor([0.5, 0.5]), 30)

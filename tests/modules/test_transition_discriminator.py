@@ -106,13 +106,29 @@ def matched(count: int, scale: Tensor) -> TensorDict:
     return td
 
 
+def test_before_it_learns_a_matched_critic_is_a_distance() -> None:
+    td = matched(5, torch.ones(S))
+    network = TransitionDiscriminator(S, A, (7, 6), matched_key=MATCHED)
+    expected = -0.25 * (td["next", "measurement"] - td[MATCHED]).abs().sum(-1, keepdim=True)
+    torch.testing.assert_close(network(td)["transition_logit"], expected)
+
+
+def test_its_first_slope_is_the_best_of_a_linear_critic() -> None:
+    """Eq. (13) with a penalty of 1, for misses of mean 1: no other slope has a smaller loss."""
+    miss = torch.rand(4000, S).mul(2.0)
+    losses = {w: -0.5 * w * float(miss.sum(-1).mean()) + S * w**2 for w in (0.15, 0.2, 0.25, 0.3, 0.35)}
+    assert min(losses, key=lambda w: losses[w]) == 0.25
+
+
 def test_the_discrepancy_from_the_robot_against_numpy_has_no_sign() -> None:
     network = TransitionDiscriminator(S, A, (7, 6), matched_key=MATCHED)
+    torch.nn.init.normal_(network.head.weight)
     td = matched(5, torch.ones(S))
     state, action, after, robot = (
         td[key].double().numpy() for key in ("measurement", "action", ("next", "measurement"), MATCHED)
     )
     expected = by_hand(network, np.concatenate((state, action, abs(after - robot)), -1))
+    expected -= 0.25 * abs(after - robot).sum(-1, keepdims=True)
     np.testing.assert_allclose(network(td)["transition_logit"].detach().numpy(), expected, rtol=1e-4, atol=1e-6)
     assert network.in_keys[-1] == MATCHED
     other = td.clone()

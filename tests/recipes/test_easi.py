@@ -79,8 +79,10 @@ def test_a_smoke_run_writes_everything(
 def test_a_resumed_search_equals_an_uninterrupted_one_bit_for_bit(
     easi: ModuleType, log: Path, tmp_path: Path, collection: str
 ) -> None:
-    critic = replace(easi.PRESETS["smoke"].critic, matched=collection == "replay")
-    options = {"noise": 0.5, "collection": collection, "critic": critic}
+    replays, preset = collection == "replay", easi.PRESETS["smoke"]
+    critic = replace(preset.critic, matched=replays)
+    search = preset.search if replays else replace(preset.search, response=None)
+    options = {"noise": 0.5, "collection": collection, "critic": critic, "search": search}
     whole = easi.train(smoke(easi, log, tmp_path, "whole", **options))
     halves = easi.train(smoke(easi, log, tmp_path, "halves", generations=1, **options))
     # What a resume was started with does not matter but for how long and how fast.
@@ -140,6 +142,8 @@ def test_the_paper_preset_is_table_s3(easi: ModuleType) -> None:
     assert paper.collection == "policy" and not paper.critic.matched, "individuals roll out the policy"
     critic = (paper.critic.optimizer, paper.critic.weight_clip, paper.critic.gradient_penalty, paper.critic.hidden)
     assert critic == ("rmsprop", 0.01, None, (128, 128))
+    own = (paper.search.response, paper.search.averaged, paper.search.min_std)
+    assert own == (None, 0.0, 0.0), "survivors move the mean, and the last one is the result"
 
 
 def test_a_noisy_log_takes_longer_windows_and_a_wide_search(easi: ModuleType, log: Path, tmp_path: Path) -> None:
@@ -150,13 +154,15 @@ def test_a_noisy_log_takes_longer_windows_and_a_wide_search(easi: ModuleType, lo
     ]
     assert known == [(1, 0), (8, 2), (1, 0), (8, 0), (1, 0)]
     at_once = [easi.replayed_at_once(cfg) for cfg in (cpu, replace(cpu, noise=1.0), replace(cpu, trajectory_length=7))]
-    assert at_once == [5, 6, 1], "of 100, 12 and 7 windows: divisors, so that no robot idles"
+    assert at_once == [6, 6, 1], "of 150, 18 and 7 windows: divisors, so that no robot idles"
     paper, settled = easi.PRESETS["paper"], replace(cpu.search, min_std=0.0)
     searches = (cpu, replace(cpu, noise=1.0), replace(cpu, noise=1.0, search=settled), replace(paper, noise=1.0))
-    assert [easi.least_std(cfg) for cfg in searches] == [0.0, 0.02, 0.0, 0.0]
+    assert [easi.least_std(cfg) for cfg in searches] == [0.005, 0.02, 0.0, 0.0]
+    narrow = replace(cpu, noise=1.0, search=replace(cpu.search, span=math.sqrt(3.0)))
+    assert easi.least_std(narrow) == pytest.approx(0.04), "half the range in logarithms, the same gains"
     for noise, count, length, counted in ((0.0, 20, 1, 1), (1.0, 2, 8, 6)):
         parts = easi.build(smoke(easi, log, tmp_path, noise=noise))
-        assert parts.collector.num_steps == count * length and parts.search.min_std == (0.02 if noise else 0.0)
+        assert parts.collector.num_steps == count * length and parts.search.min_std == (0.02 if noise else 0.005)
         assert parts.collector.collect(parts.search.ask()).shape == (8, count * counted)
         parts.simulator.close()
 
@@ -175,6 +181,9 @@ def test_a_noisy_log_takes_longer_windows_and_a_wide_search(easi: ModuleType, lo
         (("--log", "{log}", "--policy", "nowhere"), "nowhere"),
         (("--log", "{log}", "--critic.gradient-penalty", "None"), "bound on its slope"),
         (("--log", "{log}", "--collection", "policy"), "--critic.matched needs --collection replay"),
+        (("--log", "{log}", "--collection", "policy", "--critic.no-matched"), "--search.response needs --collection"),
+        (("--log", "{log}", "--search.response", "1.5"), "expected share from above 0 to 1"),
+        (("--log", "{log}", "--search.averaged", "-1"), "expected averaged, a share of the generations"),
         (("--log", "{log}", "--window", "21"), "expected --window from 1 to --trajectory-length 20, got 21"),
         (("--log", "{log}", "--window", "3", "--skip", "3"), "0 <= skip < window, got 3 and 3"),
         (("--log", "{log}", "--critic.difference"), "relative to one state"),
