@@ -50,12 +50,11 @@ class ResponseMemory:
         >>> from agility_rl.modules import TransitionDiscriminator
         >>> search = EvolutionStrategy([0.0], [1.0], population=8, generator=torch.Generator().manual_seed(0))
         >>> individuals = search.ask()
-        >>> moved = individuals.float()[:, None] * torch.ones(29)  # all entries are equal to the parameter
-        >>> def entry(value):
-        ...     return torch.as_tensor(value).expand(8, 5, 29)
+        >>> after = individuals.float()[:, None].expand(8, 5, 29)  # every entry is the parameter
         >>> transitions = TensorDict({
-        ...     "measurement": entry(0.0), "action": torch.zeros(8, 5, 12), ("collector", "mask"): torch.ones(8, 5) > 0,
-        ...     "next": {"measurement": moved[:, None].expand(8, 5, 29), "matched_measurement": entry(0.7)},
+        ...     "measurement": torch.zeros(8, 5, 29), "action": torch.zeros(8, 5, 12),
+        ...     "next": {"measurement": after, "matched_measurement": torch.full((8, 5, 29), 0.7)},
+        ...     "collector": {"mask": torch.ones(8, 5, dtype=torch.bool)},
         ... }, [8, 5])
         >>> critic = TransitionDiscriminator.from_transitions(transitions, clip=3.0, matched_key=MATCHED)
         >>> memory = ResponseMemory()
