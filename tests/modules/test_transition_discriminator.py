@@ -6,7 +6,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from agility_rl.modules import FeatureNormalizer, TransitionDiscriminator
+from agility_rl.losses import TransitionDiscriminatorLoss
+from agility_rl.modules import FeatureNormalizer, TransitionDiscriminator, transition_discriminator
+from agility_rl.modules.transition_discriminator import DISCREPANCY_SLOPE
 
 S, A = 3, 2
 
@@ -113,11 +115,21 @@ def test_before_it_learns_a_matched_critic_is_a_distance() -> None:
     torch.testing.assert_close(network(td)["transition_logit"], expected)
 
 
-def test_its_first_slope_is_the_best_of_a_linear_critic() -> None:
-    """Eq. (13) with a penalty of 1, for misses of mean 1: no other slope has a smaller loss."""
-    miss = torch.rand(4000, S).mul(2.0)
-    losses = {w: -0.5 * w * float(miss.sum(-1).mean()) + S * w**2 for w in (0.15, 0.2, 0.25, 0.3, 0.35)}
-    assert min(losses, key=lambda w: losses[w]) == 0.25
+def test_no_other_slope_begins_with_a_smaller_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eq. (13) with a penalty of 1, for misses of mean 1."""
+    simulator = matched(4000, torch.ones(S))
+    simulator[MATCHED] = simulator["next", "measurement"] - 2.0 * torch.rand(4000, S)
+    robot = simulator.clone()
+    robot["next", "measurement"] = robot[MATCHED]
+    loss = TransitionDiscriminatorLoss(
+        TransitionDiscriminator(S, A, matched_key=MATCHED), weight_clip=None, gradient_penalty=1.0
+    )
+    losses = {}
+    for share in (0.6, 0.8, 1.0, 1.2, 1.4):
+        monkeypatch.setattr(transition_discriminator, "DISCREPANCY_SLOPE", share * DISCREPANCY_SLOPE)
+        out = loss(TensorDict({"expert": robot, "policy": simulator}))
+        losses[share] = (out["loss_discriminator"] + out["loss_gradient_penalty"]).item()
+    assert min(losses, key=lambda share: losses[share]) == 1.0
 
 
 def test_the_discrepancy_from_the_robot_against_numpy_has_no_sign() -> None:
