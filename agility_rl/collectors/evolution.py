@@ -159,7 +159,7 @@ class EvolutionStrategy:
         Args:
             individuals: ``[N, D]``, what :meth:`ask` returned.
             scores: ``[N]`` or ``[N, 1]``, higher is better; who has none that is finite does not survive.
-            mean: ``[D]``, next mean, where a better one than the survivors' is known
+            mean: ``[D]``, next mean, taken as it is, where a better one than the survivors' is known
                 (:class:`agility_rl.collectors.ResponseMemory`); their spread is the next one in any case.
 
         Raises:
@@ -206,8 +206,12 @@ class EvolutionStrategy:
         """Restore what :meth:`state_dict` returned.
 
         Raises:
-            ValueError: if the state has another number of parameters.
+            ValueError: if the state has another number of parameters, or is of a version that kept the last mean only.
         """
+        if "means" not in state:
+            raise ValueError(
+                "the search was saved by an earlier version, without the means of all generations; begin anew"
+            )
         if state["covariance"].shape != self.covariance.shape:
             raise ValueError(f"the state has {len(state['covariance'])} parameters, expected {len(self.mean)}")
         self.means, self.covariance = state["means"].clone(), state["covariance"].clone()

@@ -159,6 +159,14 @@ def test_the_estimate_averages_the_last_means() -> None:
     assert torch.equal(other.estimate, es.estimate) and torch.equal(other.ask(), es.ask())
 
 
+def test_a_state_of_an_earlier_version_is_refused_in_one_line() -> None:
+    es = strategy()
+    state = es.state_dict()
+    state["mean"] = state.pop("means")
+    with pytest.raises(ValueError, match="saved by an earlier version"):
+        es.load_state_dict(state)
+
+
 def test_averaging_is_nearer_when_scores_are_noisy() -> None:
     generator, misses = torch.Generator().manual_seed(3), {0.0: 0.0, 0.5: 0.0}
     for seed in range(8):
