@@ -158,7 +158,9 @@ def least_std(cfg: Config) -> float:
     """Least standard deviation of the search, a given one before the usual one, which no first range changes."""
     if cfg.search.min_std is not None:
         return cfg.search.min_std
-    return LEAST_STD["noisy" if cfg.noise else "exact"] * math.log(SearchConfig.span) / math.log(cfg.search.span)
+    search = cfg.search
+    widest, width = (math.log(s) if search.scale == "log" else s - 1 / s for s in (SearchConfig.span, search.span))
+    return LEAST_STD["noisy" if cfg.noise else "exact"] * widest / width
 
 
 def replay_window(cfg: Config) -> tuple[int, int]:

@@ -160,6 +160,8 @@ def test_a_noisy_log_takes_longer_windows_and_a_wide_search(easi: ModuleType, lo
     assert [easi.least_std(cfg) for cfg in searches] == [0.005, 0.02, 0.0, 0.0]
     narrow = replace(cpu, noise=1.0, search=replace(cpu.search, span=math.sqrt(3.0)))
     assert easi.least_std(narrow) == pytest.approx(0.04), "half the range in logarithms, the same gains"
+    linear = replace(cpu, noise=1.0, search=replace(cpu.search, span=2.0, scale="linear"))
+    assert easi.least_std(linear) == pytest.approx(0.02 * (3 - 1 / 3) / (2 - 1 / 2))
     for noise, count, length, counted in ((0.0, 20, 1, 1), (1.0, 2, 8, 6)):
         parts = easi.build(smoke(easi, log, tmp_path, noise=noise))
         assert parts.collector.num_steps == count * length and parts.search.min_std == (0.02 if noise else 0.005)
