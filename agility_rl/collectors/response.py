@@ -38,6 +38,13 @@ class ResponseMemory:
     Source: ours, not the paper's, which moves the mean to that of the survivors
     (:class:`agility_rl.collectors.EvolutionStrategy`).
 
+    Keys read (of :meth:`remember`, ``[N, T]``; the critic reads the same, ``[T]`` of every remembered generation):
+        measurement                  float32 ``[N, T, 29]``  state in the log, the same for all individuals [SI units]
+        action                       float32 ``[N, T, 12]``  action taken in it [action units]
+        (next, measurement)          float32 ``[N, T, 29]``  what followed in the simulation [SI units]
+        (next, matched_measurement)  float32 ``[N, T, 29]``  what followed in the log [SI units]
+        (collector, mask)            bool ``[N, T]``         false where an individual diverged
+
     Args:
         share: share of the generations, counted from the last, whose windows are remembered.
         trust: farthest step in deviations of the last generation.
@@ -63,7 +70,7 @@ class ResponseMemory:
         0.7
     """
 
-    def __init__(self, *, share: float = 0.5, trust: float = 2.0, iterations: int = 20) -> None:
+    def __init__(self, *, share: float = 0.75, trust: float = 2.0, iterations: int = 20) -> None:
         if not 0.0 < share <= 1.0 or trust <= 0.0 or iterations < 1:
             raise ValueError(
                 "expected share from above 0 to 1, trust above 0 and iterations from 1, got "
@@ -116,9 +123,9 @@ class ResponseMemory:
             return search.mean.clone()
         state, action, real = (torch.cat([entry[name] for entry in self._responses]) for name in _LOG)
         # In deviations of the search every direction is about equally steep, and the trust region is a ball.
-        root = search.root.float()
+        root = search.root
         offset = torch.cat([_at(search.mean, entry) for entry in self._responses])
-        slope = torch.cat([entry["slope"] for entry in self._responses]) @ root
+        slope = torch.cat([entry["slope"] for entry in self._responses]) @ root.float()
         step = torch.zeros(len(search.mean), requires_grad=True)
         optimizer = torch.optim.LBFGS([step], max_iter=self.iterations, line_search_fn="strong_wolfe")
 
@@ -137,10 +144,12 @@ class ResponseMemory:
         with torch.enable_grad():
             optimizer.step(dislike)
         moved = step.detach() * (self.trust / step.detach().norm().clamp_min(self.trust))
-        return search.mean + search.root @ moved.double()
+        return search.mean + root @ moved.double()
 
     def state_dict(self) -> dict[str, Any]:
-        """All responses, by name."""
+        """Number of generations seen, and the remembered responses, stacked: ``offset [G, T, 29]``, ``slope``
+        ``[G, T, 29, D]``, ``mean [G, D]``, and the log's ``state``, ``action`` and ``real`` ``[G, T, ...]``.
+        """
         names = self._responses[0] if self._responses else ()
         stacked = {name: torch.stack([entry[name] for entry in self._responses]) for name in names}
         return {"generation": self.generation, "responses": stacked}
