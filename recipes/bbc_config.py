@@ -61,6 +61,8 @@ class EnvConfig:
     """Weight that is left of it; without any, a slow walk turns into standing."""
     turn_weight: float = 0.0
     """Weight of a reward for turning as fast as commanded that has a slope everywhere (ours)."""
+    rhythm_weight: float = 0.0
+    """Weight of a reward for the stride frequency and the foot phases of the behaviour's labelled clips (ours)."""
     collision_weight: float = -10.0
     """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
     episode_length: float = 20.0

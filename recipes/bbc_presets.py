@@ -39,6 +39,7 @@ CPU = Config(
         progress_weight=8.0,
         progress_fade=(120, 120),
         progress_left=4.0,
+        rhythm_weight=16.0,
         jump_weight=16.0,
         jump_width=0.03,
     ),
@@ -86,7 +87,8 @@ POLISH = replace(
     iterations=90,
     changes=(),
     motion=replace(CPU.motion, one_sided=("canter", "jump")),
-    env=replace(CPU.env, progress_weight=4.0, jump_weight=20.0),  # no fading: it walks already
+    # No fading: it walks already. No rhythm: those that this preset was made for came without.
+    env=replace(CPU.env, progress_weight=4.0, rhythm_weight=0.0, jump_weight=20.0),
     ppo=replace(
         CPU.ppo,
         learning_rate=1e-4,
@@ -111,7 +113,7 @@ QUICKSTART = replace(
     name="quickstart",
     iterations=110,
     max_minutes=5.0,
-    env=replace(CPU.env, num_robots=512),
+    env=replace(CPU.env, num_robots=512, rhythm_weight=0.0),
     imitation=replace(CPU.imitation, cloning=500),
 )
 SMOKE = replace(

@@ -20,12 +20,14 @@ from agility_rl.envs.rewards import (
     RewardTerm,
     jump_height_peak,
     jump_height_window,
+    rhythm,
     turn_progress,
     velocity_progress,
 )
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, thigh_contact
 from agility_rl.motion import MotionDataset, load_clips
 from agility_rl.motion.gaits import synthetic_dataset_clips
+from agility_rl.motion.stride_patterns import stride_patterns
 from agility_rl.simulation import HeightField, ridges, rough_pyramids
 from agility_rl.training.seeding import Seeds
 
@@ -49,6 +51,7 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
         observation_noise=cfg.env.observation_noise,
         push_interval=cfg.env.push_interval,
         episode_length=cfg.env.episode_length,
+        patterns=stride_patterns(dataset.labelled_clips) if cfg.env.rhythm_weight else None,
         motion_offsets=cfg.motion.offsets,
         seed=seeds.integer("environment"),
     )
@@ -63,6 +66,8 @@ def rewards(cfg: EnvConfig) -> dict[str, RewardTerm]:
         terms["velocity_progress"] = RewardTerm(cfg.progress_weight, velocity_progress)
     if cfg.turn_weight:
         terms["turn_progress"] = RewardTerm(cfg.turn_weight, turn_progress)
+    if cfg.rhythm_weight:
+        terms["rhythm"] = RewardTerm(cfg.rhythm_weight, rhythm)
     terms["collision"] = terms["collision"]._replace(weight=cfg.collision_weight)
     return terms
 

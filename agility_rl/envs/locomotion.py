@@ -17,6 +17,7 @@ from agility_rl.envs.observations import ObservationGroups
 from agility_rl.envs.randomization import Randomization, uniform
 from agility_rl.envs.reference import PAST, ReferenceStates
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm
+from agility_rl.envs.rhythm import Rhythm
 from agility_rl.envs.robots import CLEARANCE, Pushes, Robots
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, Termination
 from agility_rl.go2 import constants, features
@@ -56,6 +57,8 @@ class LocomotionEnv(EnvBase):
             :meth:`set_commands`.
         push_interval: seconds between pushes; ``None`` for none.
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
+        patterns: rhythm of each behaviour, as :class:`agility_rl.envs.rhythm.Rhythm` takes them, for the reward term
+            ``rhythm``; ``None`` hears none.
         motion_offsets: which discriminator frames ``motion`` holds, in control steps from the oldest; ``[N, H, 49]``
             then has their number H. With ``past_motion`` in the reference, those before an episode are the dog's.
         seed: seed of all randomness in the environment.
@@ -87,6 +90,7 @@ class LocomotionEnv(EnvBase):
         resample_period: float | None = behaviours.RESAMPLE_PERIOD,
         push_interval: float | None = None,
         push_velocity: float = 0.5,
+        patterns: TensorDictBase | None = None,
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
         seed: int = 0,
     ) -> None:
@@ -113,6 +117,7 @@ class LocomotionEnv(EnvBase):
         interval = None if push_interval is None else round(push_interval / self.dt)
         self.pushes = Pushes(n, self.generator, interval, push_velocity)
         self.robots = Robots(self.simulator, self.generator)
+        self.rhythm = None if patterns is None else Rhythm(n, patterns.to(device))
         self._step_count = torch.zeros(n, dtype=torch.int64, device=device)
         self._make_specs(n)
 
@@ -180,6 +185,8 @@ class LocomotionEnv(EnvBase):
             self.robots.randomize(mask, self.randomization)
         self._step_count = self._step_count.masked_fill(mask, 0)
         self.pushes.begin(mask)
+        if self.rhythm is not None:
+            self.rhythm.begin(mask)
         state = self.robots.begin(mask, self.commands)
         self.observations.reset(mask, state, past)
 
@@ -197,6 +204,8 @@ class LocomotionEnv(EnvBase):
         self._step_count = self._step_count + 1
 
         state = self.robots.state(action, self.commands)
+        if self.rhythm is not None:
+            state.rhythm = self.rhythm.update(state, self.commands.skill)
         terms = {
             name: (term.weight * self.dt * term.function(state)).masked_fill(state.unstable, 0.0)[:, None]
             for name, term in self.rewards.items()
@@ -246,6 +255,7 @@ class LocomotionEnv(EnvBase):
             "simulator": self.simulator.state_dict(),
             "commands": self.commands.state_dict(),
             "observations": self.observations.state_dict(),
+            **({} if self.rhythm is None else {"rhythm": self.rhythm.state_dict()}),
             "buffers": {
                 "step_count": self._step_count.clone(),
                 "push_phase": self.pushes.phase.clone(),
@@ -259,6 +269,8 @@ class LocomotionEnv(EnvBase):
         self.simulator.load_state_dict(state_dict["simulator"])
         self.commands.load_state_dict(state_dict["commands"])
         self.observations.load_state_dict(state_dict["observations"])
+        if self.rhythm is not None:
+            self.rhythm.load_state_dict(state_dict["rhythm"])
         buffers = state_dict["buffers"]
         self._step_count, self.pushes.phase = buffers["step_count"].clone(), buffers["push_phase"].clone()
         self.robots.load_state_dict(buffers)

@@ -70,6 +70,14 @@ def turn_progress(state: LocomotionState) -> Tensor:
     return (1.0 - (state.mean_yaw_rate - state.command[:, 2]).abs()).clamp(min=-1.0)
 
 
+def rhythm(state: LocomotionState) -> Tensor:
+    """How much of the feet's fore-aft motion has the stride frequency and the phases of the behaviour's clips.
+
+    Ours: :class:`agility_rl.envs.rhythm.Rhythm`, in environments that have a pattern.
+    """
+    return state.rhythm
+
+
 def jump_height_window(state: LocomotionState) -> Tensor:
     """10 while jumping and within 5 cm of the commanded height (released code)."""
     near = (state.command[:, 3] - state.root_height[:, 0]).abs() < 0.05

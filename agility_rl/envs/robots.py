@@ -141,6 +141,7 @@ class Robots:
             command=commands.command,
             jumping=commands.jumping,
             peak_height=self.heights.amax(-1),
+            rhythm=torch.zeros_like(roll),
             unstable=simulator.unstable,
             dt=self.dt,
         )

@@ -35,6 +35,7 @@ class LocomotionState:
         command: ``[N, 5]`` in the order of :data:`agility_rl.behaviours.COMMANDS`.
         jumping: bool ``[N]``, the skill is jump.
         peak_height: ``[N]`` highest trunk of the last 0.9 s [m].
+        rhythm: ``[N]`` how much of the feet's motion follows the commanded behaviour's pattern, 0 to 1 (0 without one).
         unstable: bool ``[N]``, the engine reported divergence.
         dt: control step [s].
     """
@@ -62,5 +63,6 @@ class LocomotionState:
     command: Tensor
     jumping: Tensor
     peak_height: Tensor
+    rhythm: Tensor
     unstable: Tensor
     dt: float

@@ -34,6 +34,9 @@ CALF_GROUPS = (3, 7, 11, 15)
 FOOT_GROUPS = (4, 8, 12, 16)
 """Indices into :data:`CONTACT_GROUPS`, legs in the order of :data:`LEGS`."""
 
+FOOT_PAIRS = ((0, 1), (2, 3), (0, 2), (1, 3), (0, 3), (1, 2))
+"""Feet between which a gait has phases, in the order of :data:`LEGS`: FL-FR, RL-RR, FL-RL, FR-RR, FL-RR, FR-RL."""
+
 # Posture and control -------------------------------------------------------------------------------------------------
 
 DEFAULT_POSE = (0.0, 0.9, -1.8) * 4

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from agility_rl import rotations
 from agility_rl.behaviours import BEHAVIOURS
+from agility_rl.go2.constants import FOOT_PAIRS
 from agility_rl.motion.clip import MotionClip
 
 GAIT_LABELS: tuple[str, ...] = (*BEHAVIOURS, "stand", "other")
@@ -48,7 +49,6 @@ STAND_MOTION = 0.012
 """Standard deviation of fore-aft foot motion [m] under which nobody steps."""
 
 _STRIDE_BAND = (0.4, 4.5)
-_PAIRS = ((0, 1), (2, 3), (0, 2), (1, 3), (0, 3), (1, 2))  # FL-FR, RL-RR, FL-RL, FR-RR, FL-RR, FR-RL
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,9 @@ def measure_gait(
     _check_shapes(foot_position, foot_contact, root_height, linear_velocity, yaw_rate)
     if steps * dt < 0.3:
         raise ValueError(f"a gait needs at least 0.3 s, got {steps} frames of {dt} s = {steps * dt:.2f} s")
-    fore_aft = _detrend(foot_position[..., 0].float())
-    frequency, phases = _foot_phases(fore_aft, dt)
+    fore_aft = detrend(foot_position[..., 0].float())
+    frequency, crosses = stride_spectrum(fore_aft, dt)
+    phases = crosses.angle().abs() / (2 * torch.pi)
     contact = foot_contact.float()
     velocity = linear_velocity.mean(-2)
     return GaitMeasurement(
@@ -292,7 +293,7 @@ def measure_clip(clip: MotionClip, window: float | None = None) -> GaitMeasureme
     return measure_gait(*stretch, dt=clip.dt) if window is None else measure_windows(*stretch, clip.dt, window)
 
 
-def _detrend(signal: Tensor) -> Tensor:
+def detrend(signal: Tensor) -> Tensor:
     """Remove mean and slope of ``[*B, T, 4]`` along time, so that a drifting foot does not look like a slow stride."""
     time = torch.linspace(-1.0, 1.0, signal.shape[-2], dtype=signal.dtype, device=signal.device)[:, None]
     signal = signal - signal.mean(-2, keepdim=True)
@@ -300,8 +301,17 @@ def _detrend(signal: Tensor) -> Tensor:
     return signal - slope * time
 
 
-def _foot_phases(fore_aft: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-    """Stride frequency ``[*B]`` and folded phases of the six pairs of feet ``[*B, 6]``."""
+def stride_spectrum(fore_aft: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """Stride frequency [Hz] and cross-spectra of the pairs of feet around it.
+
+    Args:
+        fore_aft: ``[*B, T, 4]`` fore-aft positions of the feet [m], detrended.
+        dt: seconds between frames.
+
+    Returns:
+        ``[*B]`` and complex ``[*B, 6]``, in the order of :data:`~agility_rl.go2.constants.FOOT_PAIRS`, whose angle is
+        how far the first foot is ahead of the second, 2 pi for a stride.
+    """
     steps = fore_aft.shape[-2]
     window = torch.hann_window(steps + 2, periodic=False, dtype=fore_aft.dtype, device=fore_aft.device)[1:-1, None]
     size = max(512, 1 << (4 * steps - 1).bit_length())
@@ -315,11 +325,8 @@ def _foot_phases(fore_aft: Tensor, dt: float) -> tuple[Tensor, Tensor]:
     allowed = (frequency >= low) & (frequency <= _STRIDE_BAND[1])
     stride = frequency[power.masked_fill(~allowed, -1.0).argmax(-1)]
     near = ((frequency - stride[..., None]).abs() < 0.4 * stride[..., None]).to(spectrum.dtype)
-    phases = []
-    for first, second in _PAIRS:
-        cross = (spectrum[..., first] * spectrum[..., second].conj() * near).sum(-1)
-        phases.append(cross.angle().abs() / (2 * torch.pi))
-    return stride, torch.stack(phases, -1)
+    crosses = [(spectrum[..., first] * spectrum[..., second].conj() * near).sum(-1) for first, second in FOOT_PAIRS]
+    return stride, torch.stack(crosses, -1)
 
 
 def _check_shapes(foot_position: Tensor, contact: Tensor, height: Tensor, velocity: Tensor, yaw_rate: Tensor) -> None:

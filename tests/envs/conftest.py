@@ -53,6 +53,7 @@ def neutral() -> Callable[..., LocomotionState]:
             **{f"{link}_contact": torch.zeros(n, 4) for link in ("hip", "thigh", "calf", "foot")},
             "command": torch.zeros(n, 5),
             "jumping": torch.zeros(n, dtype=torch.bool),
+            "rhythm": torch.zeros(n),
             "unstable": torch.zeros(n, dtype=torch.bool),
             "dt": 0.02,
         }

@@ -15,8 +15,10 @@ from agility_rl.behaviours import BEHAVIOURS, RESAMPLE_PERIOD
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.locomotion import EDGE
 from agility_rl.envs.randomization import Randomization
-from agility_rl.envs.rewards import LOCOMOTION_REWARDS
+from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm, rhythm
 from agility_rl.go2.constants import STANDING_HEIGHT
+from agility_rl.motion import synthesize_gait
+from agility_rl.motion.stride_patterns import stride_patterns
 from agility_rl.simulation import make_simulator, rough_pyramids
 
 Build = Callable[..., LocomotionEnv]
@@ -26,6 +28,8 @@ EVERYTHING: dict[str, Any] = {
     "push_interval": 0.1,
     "resample_period": 0.3,
     "episode_length": 0.5,
+    "rewards": {**LOCOMOTION_REWARDS, "rhythm": RewardTerm(1.0, rhythm)},
+    "patterns": stride_patterns([synthesize_gait(name) for name in BEHAVIOURS]),
 }
 """All randomness there is, often."""
 

@@ -37,7 +37,7 @@ def run(folder: Path, *options: str, check: bool = True) -> subprocess.Completed
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four iterations without interruption."""
     folder = tmp_path_factory.mktemp("runs")
-    run(folder, "--name", "whole", "--iterations", "4")
+    run(folder, "--name", "whole", "--iterations", "4", "--env.rhythm-weight", "1.0")
     return folder
 
 
@@ -56,13 +56,13 @@ def test_smoke_run_writes_everything_the_next_stage_needs(finished: Path) -> Non
 
 
 def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished: Path) -> None:
-    run(finished, "--name", "halves", "--iterations", "2")
+    run(finished, "--name", "halves", "--iterations", "2", "--env.rhythm-weight", "1.0")
     run(finished, "--resume", str(finished / "halves"), "--iterations", "4")
     whole, halves = (Artifact.load(finished / name / "policy").state for name in ("whole", "halves"))
     assert whole.keys() == halves.keys()
     different = [name for name, tensor in whole.items() if not torch.equal(tensor, halves[name])]
     assert not different
-    for name in ("reward/imitation", "loss_critic", "loss_discriminator", "prior/jump"):
+    for name in ("reward/imitation", "loss_critic", "loss_discriminator", "prior/jump", "task/rhythm"):
         expected, got = (read_scalars(finished / run_name)[name][1] for run_name in ("whole", "halves"))
         assert torch.equal(expected, got), name
 

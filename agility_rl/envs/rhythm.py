@@ -1,0 +1,111 @@
+"""Whether the feet of a robot swing in the rhythm of the behaviour that it is told to show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from agility_rl.envs.state import LocomotionState
+from agility_rl.go2 import constants, kinematics
+
+MEMORY = 0.6
+"""Strides after which what a foot did counts 1/e: less blurs the phase, more hides a wrong stride frequency."""
+REST = 0.016
+"""Fore-aft motion [m] beside which a standing robot's trembling is no stride."""
+SHARPNESS = 8.0
+"""Of the agreement between phases: a twelfth of a stride aside counts a third."""
+
+
+class Rhythm:
+    r"""Short memory of the fore-aft motion of the feet, and how much of it follows a dog's pattern.
+
+    A resonator at the behaviour's stride frequency f follows each foot's fore-aft position x about its mean,
+
+    .. math:: \dot z_i = \left(2 \pi i f - \tfrac{f}{0.6}\right) z_i + \tfrac{f}{0.6}\,(x_i - \bar x_i),
+
+    beside the mean square :math:`p_i` over the same time. The share of the motion that has the frequency, times the
+    agreement of the phases with the pattern's or its mirror image's, is
+
+    .. math:: \min\left(1, \frac{2 \sum |z_i|^2}{\sum p_i + 4 \cdot 0.016^2}\right)
+              \max_{\phi^*} \frac{1}{6} \sum_{ij} e^{8 (\cos 2\pi(\phi_{ij} - \phi^*_{ij}) - 1)},
+              \quad \phi_{ij} = \tfrac{1}{2\pi} \arg z_i \bar z_j.
+
+    Source: no equation of the paper (ours). A discriminator of short clips hardly hears by how much a stride is too
+    fast, or feet that a dog sets down one after the other come together.
+
+    Args:
+        num_robots: N.
+        patterns: ``[5]`` with ``frequency`` [Hz], ``phase`` and ``mirrored_phase`` [5, 6] [strides], as
+            :func:`agility_rl.motion.stride_patterns.stride_patterns` makes them; where it is, the tensors are.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> pattern = TensorDict({"frequency": torch.ones(5), "phase": torch.zeros(5, 6)}, [5])
+        >>> rhythm = Rhythm(1, pattern.set("mirrored_phase", torch.zeros(5, 6)))
+        >>> trot = torch.tensor([2])
+        >>> for step in range(200):  # all feet together, once a second
+        ...     swing = torch.full((1, 4), 0.1 * math.sin(2 * math.pi * 0.02 * step))
+        ...     heard = rhythm.hear(swing, trot, 0.02)
+        >>> bool(heard > 0.8)
+        True
+    """
+
+    def __init__(self, num_robots: int, patterns: TensorDictBase) -> None:
+        self.patterns = patterns
+        device = patterns["frequency"].device
+        self._swing = torch.zeros(num_robots, 4, dtype=torch.complex64, device=device)
+        self._power, self._mean = (torch.zeros(num_robots, 4, device=device) for _ in range(2))
+        self._fresh = torch.ones(num_robots, 1, dtype=torch.bool, device=device)
+        first, second = zip(*constants.FOOT_PAIRS, strict=True)
+        self._first, self._second = list(first), list(second)
+
+    def begin(self, mask: Tensor) -> None:
+        """Forget the past of the rows of a bool mask ``[N]``."""
+        self._fresh = self._fresh | mask[:, None]
+
+    def update(self, state: LocomotionState, skill: Tensor) -> Tensor:
+        """Follow the feet for one control step, in behaviours int64 ``[N]``; returns the agreement ``[N]``, 0 to 1."""
+        feet = kinematics.forward(state.joint_position)
+        level = feet[..., 0] * state.pitch.cos()[:, None] + feet[..., 2] * state.pitch.sin()[:, None]
+        return self.hear(level, skill, state.dt)
+
+    def hear(self, position: Tensor, skill: Tensor, dt: float) -> Tensor:
+        """The same, of fore-aft positions ``[N, 4]`` [m] of the feet."""
+        frequency = self.patterns["frequency"][skill][:, None]
+        step = dt * frequency
+        self._swing = self._swing.masked_fill(self._fresh, 0.0)
+        self._power = self._power.masked_fill(self._fresh, 0.0)
+        mean = torch.where(self._fresh, position, self._mean)
+        self._fresh = torch.zeros_like(self._fresh)
+        self._mean = mean + (position - mean) * step / (2.5 * MEMORY)
+        aside = position - self._mean
+        turn = torch.polar(torch.exp(-step / MEMORY), 2.0 * math.pi * step)
+        self._swing = self._swing * turn + aside * step / MEMORY
+        self._power = self._power + (aside.square() - self._power) * step / (2.0 * MEMORY)
+        share = 2.0 * self._swing.abs().square().mean(-1) / (self._power.mean(-1) + REST**2)
+        phase = self._swing[:, self._first] * self._swing[:, self._second].conj()
+        agreement = torch.stack([self._agreement(phase, self.patterns[name][skill]) for name in _IMAGES])
+        return share.clamp(max=1.0) * agreement.amax(0)
+
+    @staticmethod
+    def _agreement(cross: Tensor, phase: Tensor) -> Tensor:
+        return torch.exp(SHARPNESS * (torch.cos(cross.angle() - 2.0 * math.pi * phase) - 1.0)).mean(-1)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The memory."""
+        swing = torch.view_as_real(self._swing).clone()
+        return {"swing": swing, "power": self._power.clone(), "mean": self._mean.clone(), "fresh": self._fresh.clone()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self._swing = torch.view_as_complex(state["swing"].clone())
+        for name in ("power", "mean", "fresh"):
+            setattr(self, f"_{name}", state[name].clone())
+
+
+_IMAGES = ("phase", "mirrored_phase")

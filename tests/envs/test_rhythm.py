@@ -1,0 +1,119 @@
+"""The rhythm reward: known swings of the feet, its limits and invariances, and its memory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from agility_rl.envs.rewards import rhythm
+from agility_rl.envs.rhythm import MEMORY, SHARPNESS, Rhythm
+from agility_rl.envs.state import LocomotionState
+from agility_rl.go2 import constants, kinematics
+
+TROT, PACE = torch.tensor([0.0, 0.5, 0.5, 0.0]), torch.tensor([0.0, 0.5, 0.0, 0.5])
+GALLOP = torch.tensor([0.0, 0.15, 0.5, 0.62])
+
+
+def pattern_of(ahead: Tensor, frequency: float) -> TensorDict:
+    """That of feet which are so many strides ahead, for all behaviours."""
+    pairs = [(ahead[i] - ahead[j]).item() for i, j in constants.FOOT_PAIRS]
+    image = ahead[[1, 0, 3, 2]]
+    turned = [(image[i] - image[j]).item() for i, j in constants.FOOT_PAIRS]
+    phases = {"phase": torch.tensor([pairs] * 5), "mirrored_phase": torch.tensor([turned] * 5)}
+    return TensorDict({"frequency": torch.full((5,), frequency), **phases}, [5])
+
+
+def heard(
+    ahead: Tensor,
+    frequency: float,
+    pattern: TensorDict,
+    amplitude: float = 0.1,
+    seconds: float = 8.0,
+    offset: float = 0.0,
+) -> float:
+    """Mean over the last two seconds of feet that swing so."""
+    memory, skill, values = Rhythm(1, pattern), torch.zeros(1, dtype=torch.int64), []
+    for step in range(round(seconds / 0.02)):
+        angle = 2.0 * math.pi * (frequency * 0.02 * step + ahead)
+        values.append(memory.hear(offset + amplitude * torch.cos(angle)[None], skill, 0.02))
+    return float(torch.cat(values[-100:]).mean())
+
+
+@pytest.mark.parametrize("ahead", [TROT, PACE, GALLOP])
+def test_a_pattern_that_is_followed_is_worth_about_one_and_so_is_its_mirror_image(ahead: Tensor) -> None:
+    pattern = pattern_of(ahead, 2.0)
+    right = heard(ahead, 2.0, pattern)
+    assert right > 0.85
+    assert heard(ahead[[1, 0, 3, 2]], 2.0, pattern) == pytest.approx(right, abs=0.02)
+
+
+def test_where_the_feet_swing_about_and_how_far_does_not_count() -> None:
+    pattern = pattern_of(TROT, 2.0)
+    right = heard(TROT, 2.0, pattern)
+    assert heard(TROT, 2.0, pattern, offset=0.2, seconds=12.0) == pytest.approx(right, abs=0.02)
+    assert heard(TROT, 2.0, pattern, amplitude=0.2) == pytest.approx(right, abs=0.05)
+    assert heard(TROT, 2.0, pattern, amplitude=1e-3) < 0.01, "trembling is no stride"
+
+
+@pytest.mark.parametrize("detuned", [0.25, 0.5, 1.0])
+def test_a_wrong_stride_frequency_loses_what_a_resonator_loses(detuned: float) -> None:
+    """Power of a first-order resonator, 1 / (1 + (2 pi 0.6 d)^2); its answer to negative frequencies blurs it."""
+    expected = 1.0 / (1.0 + (2.0 * math.pi * MEMORY * detuned) ** 2)
+    assert heard(TROT, 1.5 * (1.0 + detuned), pattern_of(TROT, 1.5)) == pytest.approx(expected, abs=0.08)
+
+
+def test_feet_out_of_phase_lose_their_pairs() -> None:
+    """A pair aside by d counts exp(8 (cos 2 pi d - 1)); of a pace and a trot, the front and the hind pair agree."""
+    pattern = pattern_of(TROT, 2.0)
+    assert heard(PACE, 2.0, pattern) == pytest.approx(2.0 / 6.0 * heard(TROT, 2.0, pattern), abs=0.03)
+    late = TROT + torch.tensor([0.1, 0.0, 0.1, 0.0])  # left feet: four of the six pairs are aside
+    lost = math.exp(SHARPNESS * (math.cos(0.2 * math.pi) - 1.0))
+    assert heard(late, 2.0, pattern) == pytest.approx((2.0 + 4.0 * lost) / 6.0 * heard(TROT, 2.0, pattern), abs=0.05)
+
+
+def test_robots_are_heard_apart_and_a_new_episode_knows_nothing_of_the_last() -> None:
+    pattern, skill = pattern_of(TROT, 2.0), torch.zeros(2, dtype=torch.int64)
+    memory, alone = Rhythm(2, pattern), Rhythm(1, pattern)
+    for step in range(150):
+        angle = 2.0 * math.pi * (2.0 * 0.02 * step + torch.stack((TROT, PACE)))
+        if step == 100:
+            memory.begin(torch.tensor([False, True]))
+            alone = Rhythm(1, pattern)
+        both = memory.hear(torch.cos(angle), skill, 0.02)
+        single = alone.hear(torch.cos(angle[1:]), skill[1:], 0.02)
+    torch.testing.assert_close(both[1:], single)
+    assert both[0] > 0.8
+
+
+def test_a_saved_memory_goes_on_exactly() -> None:
+    pattern, skill = pattern_of(GALLOP, 2.0), torch.zeros(1, dtype=torch.int64)
+    one, other = Rhythm(1, pattern), Rhythm(1, pattern)
+    positions = torch.randn(40, 1, 4, generator=torch.Generator().manual_seed(0))
+    for position in positions[:20]:
+        one.hear(position, skill, 0.02)
+    other.load_state_dict(one.state_dict())
+    for position in positions[20:]:
+        assert torch.equal(one.hear(position, skill, 0.02), other.hear(position, skill, 0.02))
+
+
+def test_the_feet_are_those_of_the_joints_in_a_level_frame(neutral: Callable[..., LocomotionState]) -> None:
+    pattern, skill = pattern_of(TROT, 2.0), torch.zeros(1, dtype=torch.int64)
+    joints, hands = Rhythm(1, pattern), Rhythm(1, pattern)
+    pose = torch.tensor(constants.DEFAULT_POSE)
+    for step in range(60):
+        swing = (
+            0.4
+            * torch.cos(2.0 * math.pi * (2.0 * 0.02 * step + TROT)).repeat_interleave(3)
+            * torch.tensor([0, 1, 0] * 4)
+        )
+        pitch = torch.full((1,), 0.1 * math.sin(0.3 * step))
+        state = neutral(1, joint_position=(pose + swing)[None], pitch=pitch)
+        turn = torch.tensor([[pitch.cos(), 0.0, pitch.sin()], [0.0, 1.0, 0.0], [-pitch.sin(), 0.0, pitch.cos()]])
+        level = kinematics.forward(pose + swing) @ turn.T
+        torch.testing.assert_close(joints.update(state, skill), hands.hear(level[None, :, 0], skill, state.dt))
+    assert torch.equal(rhythm(neutral(1, rhythm=torch.tensor([0.3]))), torch.tensor([0.3]))
