@@ -20,6 +20,8 @@ REST = 0.016
 SHARPNESS = 8.0
 """Of the agreement between phases: a twelfth of a stride aside counts a third."""
 
+_IMAGES = ("phase", "mirrored_phase")
+
 
 class Rhythm:
     r"""Short memory of the fore-aft motion of the feet, and how much of it follows a dog's pattern.
@@ -75,7 +77,7 @@ class Rhythm:
         return self.hear(level, skill, state.dt)
 
     def hear(self, position: Tensor, skill: Tensor, dt: float) -> Tensor:
-        """The same, of fore-aft positions ``[N, 4]`` [m] of the feet."""
+        """The same, of fore-aft positions ``[N, 4]`` [m] of the feet, ``dt`` [s] after the last ones."""
         frequency = self.patterns["frequency"][skill][:, None]
         step = dt * frequency
         self._swing = self._swing.masked_fill(self._fresh, 0.0)
@@ -97,7 +99,8 @@ class Rhythm:
         return torch.exp(SHARPNESS * (torch.cos(cross.angle() - 2.0 * math.pi * phase) - 1.0)).mean(-1)
 
     def state_dict(self) -> dict[str, Any]:
-        """The memory."""
+        """The memory: ``swing [N, 4, 2]``, real and imaginary part [m]; ``power`` [m^2] and ``mean`` [m] ``[N, 4]``;
+        ``fresh`` bool ``[N, 1]``, who has none yet."""
         swing = torch.view_as_real(self._swing).clone()
         return {"swing": swing, "power": self._power.clone(), "mean": self._mean.clone(), "fresh": self._fresh.clone()}
 
@@ -106,6 +109,3 @@ class Rhythm:
         self._swing = torch.view_as_complex(state["swing"].clone())
         for name in ("power", "mean", "fresh"):
             setattr(self, f"_{name}", state[name].clone())
-
-
-_IMAGES = ("phase", "mirrored_phase")

@@ -280,17 +280,21 @@ def classify_episodes(windows: GaitMeasurement) -> tuple[Tensor, GaitMeasurement
 
 def measure_clip(clip: MotionClip, window: float | None = None) -> GaitMeasurement:
     """Measure a motion clip; with ``window`` [s], piece by piece as :func:`measure_windows`."""
-    relative = clip.foot_position - clip.root_position[:, None]
-    # The heading frame, not the base frame: a pitching trunk must not move the feet fore and aft.
     heading = rotations.heading(clip.root_quaternion)
     stretch = (
-        rotations.rotate_inverse(heading[:, None], relative),
+        level_feet(clip),
         clip.foot_contact,
         clip.root_position[:, 2],
         rotations.rotate_inverse(heading, clip.root_linear_velocity),
         clip.root_angular_velocity[:, 2],
     )
     return measure_gait(*stretch, dt=clip.dt) if window is None else measure_windows(*stretch, clip.dt, window)
+
+
+def level_feet(clip: MotionClip) -> Tensor:
+    """Feet relative to the trunk, ``[T, 4, 3]`` [m], in the heading frame: its pitching must not move them fore and aft."""
+    heading = rotations.heading(clip.root_quaternion)
+    return rotations.rotate_inverse(heading[:, None], clip.foot_position - clip.root_position[:, None])
 
 
 def detrend(signal: Tensor) -> Tensor:

@@ -8,11 +8,10 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from agility_rl import rotations
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.go2.constants import FOOT_PAIRS
 from agility_rl.motion.clip import MotionClip, MotionError
-from agility_rl.motion.gait_analysis import detrend, stride_spectrum
+from agility_rl.motion.gait_analysis import detrend, level_feet, stride_spectrum
 
 MIRRORED_PAIRS = ((0, True), (1, True), (3, False), (2, False), (5, False), (4, False))
 """Which of :data:`~agility_rl.go2.constants.FOOT_PAIRS` each of them becomes in a mirror, and whether its feet change
@@ -76,7 +75,5 @@ def stride_patterns(clips: Sequence[MotionClip]) -> TensorDict:
 
 def _spectrum(clip: MotionClip) -> tuple[Tensor, Tensor]:
     """Stride frequency ``()`` and cross-spectra ``[6]`` of length one."""
-    relative = clip.foot_position - clip.root_position[:, None]
-    forward = rotations.rotate_inverse(rotations.heading(clip.root_quaternion)[:, None], relative)[..., 0]
-    frequency, cross = stride_spectrum(detrend(forward.float()), clip.dt)
+    frequency, cross = stride_spectrum(detrend(level_feet(clip)[..., 0].float()), clip.dt)
     return frequency, cross / cross.abs()
