@@ -292,7 +292,7 @@ def measure_clip(clip: MotionClip, window: float | None = None) -> GaitMeasureme
 
 
 def level_feet(clip: MotionClip) -> Tensor:
-    """Feet relative to the trunk, ``[T, 4, 3]`` [m], in the heading frame: its pitching must not move them fore and aft."""
+    """Feet relative to the trunk, ``[T, 4, 3]`` [m], in the heading frame, so that pitching does not move them."""
     heading = rotations.heading(clip.root_quaternion)
     return rotations.rotate_inverse(heading[:, None], clip.foot_position - clip.root_position[:, None])
 
