@@ -26,14 +26,15 @@ _IMAGES = ("phase", "mirrored_phase")
 class Rhythm:
     r"""Short memory of the fore-aft motion of the feet, and how much of it follows a dog's pattern.
 
-    A resonator at the behaviour's stride frequency f follows each foot's fore-aft position x about its mean,
+    A resonator at the behaviour's stride frequency :math:`f = f_0 + g\,(|v^*| - v_0)`, at least :math:`f_0 / 2`,
+    follows each foot's fore-aft position x about its mean,
 
     .. math:: \dot z_i = \left(2 \pi i f - \tfrac{f}{0.6}\right) z_i + \tfrac{f}{0.6}\,(x_i - \bar x_i),
 
-    beside the mean square :math:`p_i` over the same time. The share of the motion that has the frequency, times the
-    agreement of the phases with the pattern's or its mirror image's, is
+    beside the mean square :math:`p_i` over the same time. The share of the motion that has the frequency, beside the
+    dogs' own share s, times the agreement of the phases with the pattern's or its mirror image's, is
 
-    .. math:: \min\left(1, \frac{2 \sum |z_i|^2}{\sum p_i + 4 \cdot 0.016^2}\right)
+    .. math:: \min\left(1, \frac{1}{s} \frac{2 \sum |z_i|^2}{\sum p_i + 4 \cdot 0.016^2}\right)
               \max_{\phi^*} \frac{1}{6} \sum_{ij} e^{8 (\cos 2\pi(\phi_{ij} - \phi^*_{ij}) - 1)},
               \quad \phi_{ij} = \tfrac{1}{2\pi} \arg z_i \bar z_j.
 
@@ -42,17 +43,19 @@ class Rhythm:
 
     Args:
         num_robots: N.
-        patterns: ``[5]`` with ``frequency`` [Hz], ``phase`` and ``mirrored_phase`` [5, 6] [strides], as
+        patterns: ``[5]`` with ``frequency`` [Hz] :math:`f_0`, ``speed`` [m/s] :math:`v_0`, ``growth`` [1/m] g,
+            ``share`` s, ``phase`` and ``mirrored_phase`` [5, 6] [strides], as
             :func:`agility_rl.motion.stride_patterns.stride_patterns` makes them; where it is, the tensors are.
 
     Example:
         >>> from tensordict import TensorDict
-        >>> pattern = TensorDict({"frequency": torch.ones(5), "phase": torch.zeros(5, 6)}, [5])
-        >>> rhythm = Rhythm(1, pattern.set("mirrored_phase", torch.zeros(5, 6)))
+        >>> pattern = {name: torch.ones(5) for name in ("frequency", "speed", "growth", "share")}
+        >>> pattern |= {"phase": torch.zeros(5, 6), "mirrored_phase": torch.zeros(5, 6)}
+        >>> rhythm = Rhythm(1, TensorDict(pattern, [5]))
         >>> trot = torch.tensor([2])
         >>> for step in range(200):  # all feet together, once a second
         ...     swing = torch.full((1, 4), 0.1 * math.sin(2 * math.pi * 0.02 * step))
-        ...     heard = rhythm.hear(swing, trot, 0.02)
+        ...     heard = rhythm.hear(swing, trot, torch.ones(1), 0.02)
         >>> bool(heard > 0.8)
         True
     """
@@ -74,12 +77,15 @@ class Rhythm:
         """Follow the feet for one control step, in behaviours int64 ``[N]``; returns the agreement ``[N]``, 0 to 1."""
         feet = kinematics.forward(state.joint_position)
         level = feet[..., 0] * state.pitch.cos()[:, None] + feet[..., 2] * state.pitch.sin()[:, None]
-        return self.hear(level, skill, state.dt)
+        return self.hear(level, skill, state.command[:, :2].norm(dim=-1), state.dt)
 
-    def hear(self, position: Tensor, skill: Tensor, dt: float) -> Tensor:
-        """The same, of fore-aft positions ``[N, 4]`` [m] of the feet, ``dt`` [s] after the last ones."""
-        frequency = self.patterns["frequency"][skill][:, None]
-        step = dt * frequency
+    def hear(self, position: Tensor, skill: Tensor, speed: Tensor, dt: float) -> Tensor:
+        """The same, of fore-aft positions ``[N, 4]`` [m] of the feet, ``dt`` [s] after the last ones; commanded are
+        speeds ``[N]`` [m/s]."""
+        pattern = self.patterns[skill]
+        usual = pattern["frequency"]
+        faster = pattern["growth"] * (speed - pattern["speed"])
+        step = dt * torch.maximum(usual + faster, 0.5 * usual)[:, None]
         self._swing = self._swing.masked_fill(self._fresh, 0.0)
         self._power = self._power.masked_fill(self._fresh, 0.0)
         mean = torch.where(self._fresh, position, self._mean)
@@ -89,9 +95,9 @@ class Rhythm:
         turn = torch.polar(torch.exp(-step / MEMORY), 2.0 * math.pi * step)
         self._swing = self._swing * turn + aside * step / MEMORY
         self._power = self._power + (aside.square() - self._power) * step / (2.0 * MEMORY)
-        share = 2.0 * self._swing.abs().square().mean(-1) / (self._power.mean(-1) + REST**2)
+        share = 2.0 * self._swing.abs().square().mean(-1) / (self._power.mean(-1) + REST**2) / pattern["share"]
         phase = self._swing[:, self._first] * self._swing[:, self._second].conj()
-        agreement = torch.stack([self._agreement(phase, self.patterns[name][skill]) for name in _IMAGES])
+        agreement = torch.stack([self._agreement(phase, pattern[name]) for name in _IMAGES])
         return share.clamp(max=1.0) * agreement.amax(0)
 
     @staticmethod

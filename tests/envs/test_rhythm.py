@@ -19,13 +19,14 @@ TROT, PACE = torch.tensor([0.0, 0.5, 0.5, 0.0]), torch.tensor([0.0, 0.5, 0.0, 0.
 GALLOP = torch.tensor([0.0, 0.15, 0.5, 0.62])
 
 
-def pattern_of(ahead: Tensor, frequency: float) -> TensorDict:
-    """That of feet which are so many strides ahead, for all behaviours."""
+def pattern_of(ahead: Tensor, frequency: float, growth: float = 0.0, share: float = 1.0) -> TensorDict:
+    """That of feet which are so many strides ahead at 1 m/s, for all behaviours."""
     pairs = [(ahead[i] - ahead[j]).item() for i, j in constants.FOOT_PAIRS]
     image = ahead[[1, 0, 3, 2]]
     turned = [(image[i] - image[j]).item() for i, j in constants.FOOT_PAIRS]
     phases = {"phase": torch.tensor([pairs] * 5), "mirrored_phase": torch.tensor([turned] * 5)}
-    return TensorDict({"frequency": torch.full((5,), frequency), **phases}, [5])
+    figures = {"frequency": frequency, "speed": 1.0, "growth": growth, "share": share}
+    return TensorDict({name: torch.full((5,), value) for name, value in figures.items()} | phases, [5])
 
 
 def heard(
@@ -35,12 +36,14 @@ def heard(
     amplitude: float = 0.1,
     seconds: float = 8.0,
     offset: float = 0.0,
+    speed: float = 1.0,
 ) -> float:
     """Mean over the last two seconds of feet that swing so."""
     memory, skill, values = Rhythm(1, pattern), torch.zeros(1, dtype=torch.int64), []
+    told = torch.tensor([speed])
     for step in range(round(seconds / 0.02)):
         angle = 2.0 * math.pi * (frequency * 0.02 * step + ahead)
-        values.append(memory.hear(offset + amplitude * torch.cos(angle)[None], skill, 0.02))
+        values.append(memory.hear(offset + amplitude * torch.cos(angle)[None], skill, told, 0.02))
     return float(torch.cat(values[-100:]).mean())
 
 
@@ -67,6 +70,28 @@ def test_a_wrong_stride_frequency_loses_what_a_resonator_loses(detuned: float) -
     assert heard(TROT, 1.5 * (1.0 + detuned), pattern_of(TROT, 1.5)) == pytest.approx(expected, abs=0.08)
 
 
+def test_the_stride_frequency_grows_with_the_commanded_speed_and_is_never_less_than_half() -> None:
+    pattern = pattern_of(TROT, 1.0, growth=1.5)
+    right = heard(TROT, 1.0, pattern)
+    assert heard(TROT, 2.5, pattern, speed=2.0) == pytest.approx(right, abs=0.05)
+    assert heard(TROT, 2.5, pattern, speed=1.0) < 0.3 * right
+    assert heard(TROT, 0.5, pattern, speed=0.0, seconds=16.0) == pytest.approx(right, abs=0.05)
+
+
+def test_motion_counts_beside_what_a_sine_is_of_the_dogs() -> None:
+    """Half of the power in the third harmonic: half, and more where the dogs' motion is no sine either."""
+    skill, speed, values = torch.zeros(1, dtype=torch.int64), torch.ones(1), []
+    for share in (1.0, 0.75, 0.2):
+        memory, last = Rhythm(1, pattern_of(TROT, 2.0, share=share)), []
+        for step in range(400):
+            angle = 2.0 * math.pi * (2.0 * 0.02 * step + TROT)
+            last.append(memory.hear(0.2 * (angle.cos() + (3.0 * angle).cos())[None], skill, speed, 0.02))
+        values.append(float(torch.cat(last[-100:]).mean()))
+    assert values[0] == pytest.approx(0.5, abs=0.06)
+    assert values[1] == pytest.approx(values[0] / 0.75, abs=0.03)
+    assert 0.9 < values[2] <= 1.0
+
+
 def test_feet_out_of_phase_lose_their_pairs() -> None:
     """A pair aside by d counts exp(8 (cos 2 pi d - 1)); of a pace and a trot, the front and the hind pair agree."""
     pattern = pattern_of(TROT, 2.0)
@@ -77,32 +102,32 @@ def test_feet_out_of_phase_lose_their_pairs() -> None:
 
 
 def test_robots_are_heard_apart_and_a_new_episode_knows_nothing_of_the_last() -> None:
-    pattern, skill = pattern_of(TROT, 2.0), torch.zeros(2, dtype=torch.int64)
+    pattern, skill, speed = pattern_of(TROT, 2.0), torch.zeros(2, dtype=torch.int64), torch.ones(2)
     memory, alone = Rhythm(2, pattern), Rhythm(1, pattern)
     for step in range(150):
         angle = 2.0 * math.pi * (2.0 * 0.02 * step + torch.stack((TROT, PACE)))
         if step == 100:
             memory.begin(torch.tensor([False, True]))
             alone = Rhythm(1, pattern)
-        both = memory.hear(torch.cos(angle), skill, 0.02)
-        single = alone.hear(torch.cos(angle[1:]), skill[1:], 0.02)
+        both = memory.hear(torch.cos(angle), skill, speed, 0.02)
+        single = alone.hear(torch.cos(angle[1:]), skill[1:], speed[1:], 0.02)
     torch.testing.assert_close(both[1:], single)
     assert both[0] > 0.8
 
 
 def test_a_saved_memory_goes_on_exactly() -> None:
-    pattern, skill = pattern_of(GALLOP, 2.0), torch.zeros(1, dtype=torch.int64)
+    pattern, skill, speed = pattern_of(GALLOP, 2.0), torch.zeros(1, dtype=torch.int64), torch.ones(1)
     one, other = Rhythm(1, pattern), Rhythm(1, pattern)
     positions = torch.randn(40, 1, 4, generator=torch.Generator().manual_seed(0))
     for position in positions[:20]:
-        one.hear(position, skill, 0.02)
+        one.hear(position, skill, speed, 0.02)
     other.load_state_dict(one.state_dict())
     for position in positions[20:]:
-        assert torch.equal(one.hear(position, skill, 0.02), other.hear(position, skill, 0.02))
+        assert torch.equal(one.hear(position, skill, speed, 0.02), other.hear(position, skill, speed, 0.02))
 
 
 def test_the_feet_are_those_of_the_joints_in_a_level_frame(neutral: Callable[..., LocomotionState]) -> None:
-    pattern, skill = pattern_of(TROT, 2.0), torch.zeros(1, dtype=torch.int64)
+    pattern, skill = pattern_of(TROT, 2.0, growth=1.0), torch.zeros(1, dtype=torch.int64)
     joints, hands = Rhythm(1, pattern), Rhythm(1, pattern)
     pose = torch.tensor(constants.DEFAULT_POSE)
     for step in range(60):
@@ -112,8 +137,10 @@ def test_the_feet_are_those_of_the_joints_in_a_level_frame(neutral: Callable[...
             * torch.tensor([0, 1, 0] * 4)
         )
         pitch = torch.full((1,), 0.1 * math.sin(0.3 * step))
-        state = neutral(1, joint_position=(pose + swing)[None], pitch=pitch)
+        command = torch.tensor([[0.3, -0.4, 1.0, 0.0, 0.3]])
+        state = neutral(1, joint_position=(pose + swing)[None], pitch=pitch, command=command)
         turn = torch.tensor([[pitch.cos(), 0.0, pitch.sin()], [0.0, 1.0, 0.0], [-pitch.sin(), 0.0, pitch.cos()]])
         level = kinematics.forward(pose + swing) @ turn.T
-        torch.testing.assert_close(joints.update(state, skill), hands.hear(level[None, :, 0], skill, state.dt))
+        by_hand = hands.hear(level[None, :, 0], skill, torch.tensor([0.5]), state.dt)
+        torch.testing.assert_close(joints.update(state, skill), by_hand)
     assert torch.equal(rhythm(neutral(1, rhythm=torch.tensor([0.3]))), torch.tensor([0.3]))

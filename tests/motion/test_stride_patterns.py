@@ -8,9 +8,9 @@ import torch
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.motion import MotionError, synthesize_gait
 from agility_rl.motion.edit import mirror
-from agility_rl.motion.gait_analysis import measure_clip
+from agility_rl.motion.gait_analysis import level_feet, measure_clip
 from agility_rl.motion.gaits import synthetic_dataset_clips
-from agility_rl.motion.stride_patterns import mirrored, stride_patterns
+from agility_rl.motion.stride_patterns import FREQUENCY_GROWTH, mirrored, stride_patterns
 
 
 def test_patterns_are_what_the_gait_measurement_finds() -> None:
@@ -19,9 +19,28 @@ def test_patterns_are_what_the_gait_measurement_finds() -> None:
     for index, clip in enumerate(clips):
         found, phase = measure_clip(clip), patterns["phase"][index].abs()
         torch.testing.assert_close(patterns["frequency"][index], found.stride_frequency)
+        torch.testing.assert_close(patterns["speed"][index], found.speed, atol=0.02, rtol=0.02)
         torch.testing.assert_close(phase[0], found.phase_left_right_front)
         torch.testing.assert_close(phase[2:4].mean(), found.phase_lateral)
         torch.testing.assert_close(phase[4:].mean(), found.phase_diagonal)
+
+
+def test_the_share_of_a_sine_is_what_the_power_spectrum_has_at_the_stride_frequency() -> None:
+    """Of whole strides, the bins of a discrete Fourier transform are the sines."""
+    clips = [synthesize_gait(name) for name in BEHAVIOURS]
+    patterns = stride_patterns(clips)
+    for index, clip in enumerate(clips):
+        frequency = patterns["frequency"][index].item()
+        strides = int(clip.num_frames * clip.dt * frequency)
+        steps = round(strides / frequency / clip.dt)
+        swing = level_feet(clip)[:steps, :, 0].float()
+        power = torch.fft.rfft(swing - swing.mean(0), dim=0).abs().square().sum(-1)
+        assert patterns["share"][index].item() == pytest.approx((power[strides] / power.sum()).item(), abs=0.06)
+
+
+def test_only_the_walk_hurries_with_its_speed() -> None:
+    growth = stride_patterns([synthesize_gait(name) for name in BEHAVIOURS])["growth"]
+    assert growth.tolist() == [FREQUENCY_GROWTH["walk"], 0.0, 0.0, 0.0, 0.0]
 
 
 def test_a_mirrored_clip_has_the_mirrored_pattern() -> None:
