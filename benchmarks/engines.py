@@ -195,7 +195,7 @@ def env_step(env: LocomotionEnv) -> Callable[[Tensor], None]:
 def main() -> None:
     """Compare and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--controller", type=Path, default=Path("pretrained/bbc"))
+    parser.add_argument("--controller", type=Path, default=Path("pretrained/bbc_joined"))
     parser.add_argument("--device", default="cpu", help="of Warp")
     parser.add_argument("--robots", type=int, default=256, help="of the speed")
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))

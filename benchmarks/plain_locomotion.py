@@ -34,6 +34,8 @@ class PlainLocomotion:
             env.robots.randomize(mask, env.randomization)
         env._step_count = env._step_count.masked_fill(mask, 0)
         env.pushes.begin(mask)
+        if env.rhythm is not None:
+            env.rhythm.begin(mask)
         state = env.robots.begin(mask, env.commands)
         env.observations.reset(mask, state)
         return self._observe(state)
@@ -45,6 +47,8 @@ class PlainLocomotion:
         env.robots.step(action)
         env._step_count = env._step_count + 1
         state = env.robots.state(action, env.commands)
+        if env.rhythm is not None:
+            state.rhythm = env.rhythm.update(state, env.commands.skill)
         terms = torch.stack([term.weight * term.function(state) for term in env.rewards.values()])
         self.terms = dict(zip(env.rewards, terms, strict=True))
         reward = (env.dt * terms).masked_fill(state.unstable, 0.0).sum(0).clamp(min=0.0)

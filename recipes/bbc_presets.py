@@ -39,7 +39,7 @@ CPU = Config(
         progress_weight=8.0,
         progress_fade=(120, 120),
         progress_left=4.0,
-        rhythm_weight=16.0,
+        rhythm_weight=20.0,
         jump_weight=16.0,
         jump_width=0.03,
     ),

@@ -28,7 +28,6 @@ from rich.console import Console
 from rollouts import Controller, Motion, MotionConfig, Recording, join, load_controller, load_motion, make_env, record
 from torch import Tensor
 
-from agility_rl import rotations
 from agility_rl.behaviours import BEHAVIOURS, JUMP, NUM_BEHAVIOURS, sample_commands
 from agility_rl.envs.randomization import Randomization
 from agility_rl.go2.constants import CONTROL_DT as DT
@@ -39,8 +38,10 @@ from agility_rl.motion.gait_analysis import (
     GaitMeasurement,
     classify_episodes,
     classify_index,
+    clip_stance_share,
     measure_clip,
     measure_windows,
+    stance_share,
 )
 from agility_rl.record.plots import behaviour_matrix, save_figure
 from agility_rl.training import cli, metrics
@@ -104,17 +105,6 @@ def simulate(
     return join(parts)
 
 
-def stance_share(feet: Tensor, velocity: Tensor, yaw_rate: Tensor) -> Tensor:
-    """Duty factor ``[*B]``: share of time in which a foot goes forward over the ground at less than half of the trunk's
-    speed, mean of the feet.
-
-    Feet of retargeted dogs hover or sink by centimetres, so heights and forces would not measure dog and robot alike;
-    on the synthetic gaits, whose contacts are known, this is right to 0.06.
-    """
-    foot = torch.gradient(feet[..., 0], spacing=DT, dim=-2)[0] + velocity[..., :1] - yaw_rate[..., None] * feet[..., 1]
-    return (foot < 0.5 * velocity[..., :1].mean(-2, keepdim=True).clamp(min=0.2)).float().mean((-1, -2))
-
-
 def gait_figures(m: GaitMeasurement, duty: Tensor) -> dict[str, Tensor]:
     """The figures that a robot and a dog are compared by."""
     return {
@@ -133,7 +123,7 @@ def name_gaits(recording: Recording, start: int) -> tuple[Tensor, dict[str, Tens
     if upright.any():
         feet, sole, height, velocity, yaw_rate = recording.stretch(upright, start)
         shown[upright], typical = classify_episodes(measure_windows(feet, sole, height, velocity, yaw_rate, DT, WINDOW))
-        for name, values in gait_figures(typical, stance_share(feet, velocity, yaw_rate)).items():
+        for name, values in gait_figures(typical, stance_share(feet, velocity, yaw_rate, DT)).items():
             figures[name] = torch.full((len(upright),), math.nan).masked_scatter(upright, values)
     return shown, figures
 
@@ -143,10 +133,7 @@ def dog_figures(clips: list[MotionClip], name: str) -> dict[str, list[float]]:
     rows, agreeing = [], []
     for clip in (clip for clip in clips if clip.label == name):
         winner, m = classify_episodes(measure_clip(clip, WINDOW))
-        heading = rotations.heading(clip.root_quaternion)
-        feet = rotations.rotate_inverse(heading[:, None], clip.foot_position - clip.root_position[:, None])
-        velocity = rotations.rotate_inverse(heading, clip.root_linear_velocity)
-        rows.append(gait_figures(m, stance_share(feet, velocity, clip.root_angular_velocity[:, 2])))
+        rows.append(gait_figures(m, clip_stance_share(clip)))
         agreeing += rows[-1:] if GAIT_LABELS[int(winner)] == name else []
     return {key: [row[key].item() for row in agreeing or rows] for key in rows[0]}
 

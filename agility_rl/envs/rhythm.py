@@ -12,15 +12,21 @@ from torch import Tensor
 
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants, kinematics
+from agility_rl.go2.features import in_stance
 
 MEMORY = 0.6
 """Strides after which what a foot did counts 1/e: less blurs the phase, more hides a wrong stride frequency."""
 REST = 0.016
 """Fore-aft motion [m] beside which a standing robot's trembling is no stride."""
+STANCE_MEMORY = 2.0
+"""Strides after which whether a foot stood counts 1/e."""
+STANCE_WIDTH = 0.15
+"""Miss of the duty factor that counts 1/e."""
 SHARPNESS = 8.0
 """Of the agreement between phases: a twelfth of a stride aside counts a third."""
 
 _IMAGES = ("phase", "mirrored_phase")
+_REAL = ("power", "mean", "last", "stance", "fresh")
 
 
 class Rhythm:
@@ -31,10 +37,13 @@ class Rhythm:
 
     .. math:: \dot z_i = \left(2 \pi i f - \tfrac{f}{0.6}\right) z_i + \tfrac{f}{0.6}\,(x_i - \bar x_i),
 
-    beside the mean square :math:`p_i` over the same time. The share of the motion that has the frequency, beside the
-    dogs' own share s, times the agreement of the phases with the pattern's or its mirror image's, is
+    beside the mean square :math:`p_i` over the same time; :math:`d` is the share of the last two strides in which a
+    foot stood (:func:`~agility_rl.go2.features.in_stance`). The share of the motion that has the frequency,
+    beside the dogs' own share s, times the agreements of the duty factor and of the phases with the pattern's or its
+    mirror image's, is
 
     .. math:: \min\left(1, \frac{1}{s} \frac{2 \sum |z_i|^2}{\sum p_i + 4 \cdot 0.016^2}\right)
+              \exp\left(-\frac{(d - d^*)^2}{0.15^2}\right)
               \max_{\phi^*} \frac{1}{6} \sum_{ij} e^{8 (\cos 2\pi(\phi_{ij} - \phi^*_{ij}) - 1)},
               \quad \phi_{ij} = \tfrac{1}{2\pi} \arg z_i \bar z_j.
 
@@ -44,18 +53,18 @@ class Rhythm:
     Args:
         num_robots: N.
         patterns: ``[5]`` with ``frequency`` [Hz] :math:`f_0`, ``speed`` [m/s] :math:`v_0`, ``growth`` [1/m] g,
-            ``share`` s, ``phase`` and ``mirrored_phase`` [5, 6] [strides], as
+            ``share`` s, ``duty`` :math:`d^*`, ``phase`` and ``mirrored_phase`` [5, 6] [strides], as
             :func:`agility_rl.motion.stride_patterns.stride_patterns` makes them; where it is, the tensors are.
 
     Example:
         >>> from tensordict import TensorDict
         >>> pattern = {name: torch.ones(5) for name in ("frequency", "speed", "growth", "share")}
-        >>> pattern |= {"phase": torch.zeros(5, 6), "mirrored_phase": torch.zeros(5, 6)}
+        >>> pattern |= {"duty": torch.full((5,), 0.5), "phase": torch.zeros(5, 6), "mirrored_phase": torch.zeros(5, 6)}
         >>> rhythm = Rhythm(1, TensorDict(pattern, [5]))
         >>> trot = torch.tensor([2])
-        >>> for step in range(200):  # all feet together, once a second
+        >>> for step in range(200):  # all feet together, once a second, on the spot
         ...     swing = torch.full((1, 4), 0.1 * math.sin(2 * math.pi * 0.02 * step))
-        ...     heard = rhythm.hear(swing, trot, torch.ones(1), 0.02)
+        ...     heard = rhythm.hear(swing, torch.zeros(2, 1), trot, torch.ones(1), 0.02)
         >>> bool(heard > 0.8)
         True
     """
@@ -65,6 +74,7 @@ class Rhythm:
         device = patterns["frequency"].device
         self._swing = torch.zeros(num_robots, 4, dtype=torch.complex64, device=device)
         self._power, self._mean = (torch.zeros(num_robots, 4, device=device) for _ in range(2))
+        self._last, self._stance = torch.zeros(num_robots, 4, device=device), torch.zeros(num_robots, device=device)
         self._fresh = torch.ones(num_robots, 1, dtype=torch.bool, device=device)
         first, second = zip(*constants.FOOT_PAIRS, strict=True)
         self._first, self._second = list(first), list(second)
@@ -77,11 +87,12 @@ class Rhythm:
         """Follow the feet for one control step, in behaviours int64 ``[N]``; returns the agreement ``[N]``, 0 to 1."""
         feet = kinematics.forward(state.joint_position)
         level = feet[..., 0] * state.pitch.cos()[:, None] + feet[..., 2] * state.pitch.sin()[:, None]
-        return self.hear(level, skill, state.command[:, :2].norm(dim=-1), state.dt)
+        forward = torch.stack((state.linear_velocity[:, 0], state.mean_velocity[:, 0]))
+        return self.hear(level, forward, skill, state.command[:, :2].norm(dim=-1), state.dt)
 
-    def hear(self, position: Tensor, skill: Tensor, speed: Tensor, dt: float) -> Tensor:
-        """The same, of fore-aft positions ``[N, 4]`` [m] of the feet, ``dt`` [s] after the last ones; commanded are
-        speeds ``[N]`` [m/s]."""
+    def hear(self, position: Tensor, forward: Tensor, skill: Tensor, speed: Tensor, dt: float) -> Tensor:
+        """The same, of fore-aft positions ``[N, 4]`` [m] of the feet, ``dt`` [s] after the last ones; the trunk goes
+        ``forward`` ``[2, N]`` [m/s], now and on the mean, and is told to go at speeds ``[N]`` [m/s]."""
         pattern = self.patterns[skill]
         usual = pattern["frequency"]
         faster = pattern["growth"] * (speed - pattern["speed"])
@@ -89,7 +100,12 @@ class Rhythm:
         self._swing = self._swing.masked_fill(self._fresh, 0.0)
         self._power = self._power.masked_fill(self._fresh, 0.0)
         mean = torch.where(self._fresh, position, self._mean)
-        self._fresh = torch.zeros_like(self._fresh)
+        last = torch.where(self._fresh, position, self._last)
+        stance = torch.where(self._fresh[:, 0], pattern["duty"], self._stance)
+        self._fresh, self._last = torch.zeros_like(self._fresh), position
+        now, usually = forward[..., None]
+        standing = in_stance((position - last) / dt + now, usually).float().mean(-1)
+        self._stance = stance + (standing - stance) * step[:, 0] / STANCE_MEMORY
         self._mean = mean + (position - mean) * step / (2.5 * MEMORY)
         aside = position - self._mean
         turn = torch.polar(torch.exp(-step / MEMORY), 2.0 * math.pi * step)
@@ -98,20 +114,21 @@ class Rhythm:
         share = 2.0 * self._swing.abs().square().mean(-1) / (self._power.mean(-1) + REST**2) / pattern["share"]
         phase = self._swing[:, self._first] * self._swing[:, self._second].conj()
         agreement = torch.stack([self._agreement(phase, pattern[name]) for name in _IMAGES])
-        return share.clamp(max=1.0) * agreement.amax(0)
+        miss = (self._stance - pattern["duty"]) / STANCE_WIDTH
+        return share.clamp(max=1.0) * agreement.amax(0) * torch.exp(-miss.square())
 
     @staticmethod
     def _agreement(cross: Tensor, phase: Tensor) -> Tensor:
         return torch.exp(SHARPNESS * (torch.cos(cross.angle() - 2.0 * math.pi * phase) - 1.0)).mean(-1)
 
     def state_dict(self) -> dict[str, Any]:
-        """The memory: ``swing [N, 4, 2]``, real and imaginary part [m]; ``power`` [m^2] and ``mean`` [m] ``[N, 4]``;
-        ``fresh`` bool ``[N, 1]``, who has none yet."""
+        """The memory: ``swing [N, 4, 2]``, real and imaginary part [m]; ``power`` [m^2], ``mean`` and ``last`` [m]
+        ``[N, 4]``; ``stance`` ``[N]``; ``fresh`` bool ``[N, 1]``, who has none yet."""
         swing = torch.view_as_real(self._swing).clone()
-        return {"swing": swing, "power": self._power.clone(), "mean": self._mean.clone(), "fresh": self._fresh.clone()}
+        return {"swing": swing} | {name: getattr(self, f"_{name}").clone() for name in _REAL}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
         self._swing = torch.view_as_complex(state["swing"].clone())
-        for name in ("power", "mean", "fresh"):
+        for name in _REAL:
             setattr(self, f"_{name}", state[name].clone())

@@ -285,3 +285,13 @@ def clip_frames(
         joint_position,
         joint_velocity,
     )
+
+
+def in_stance(foot_velocity: Tensor, velocity: Tensor) -> Tensor:
+    """Whether feet stand that go forward over the ground at ``foot_velocity`` [m/s]: slower than half of the trunk's.
+
+    Example:
+        >>> in_stance(torch.tensor([0.1, 2.5]), torch.tensor(1.0))
+        tensor([ True, False])
+    """
+    return foot_velocity < 0.5 * velocity.clamp(min=0.2)

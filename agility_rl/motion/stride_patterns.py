@@ -11,7 +11,7 @@ from torch import Tensor
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.go2.constants import FOOT_PAIRS
 from agility_rl.motion.clip import MotionClip, MotionError
-from agility_rl.motion.gait_analysis import detrend, level_feet, stride_spectrum
+from agility_rl.motion.gait_analysis import clip_stance_share, detrend, level_feet, stride_spectrum
 
 MIRRORED_PAIRS = ((0, True), (1, True), (3, False), (2, False), (5, False), (4, False))
 """Which of :data:`~agility_rl.go2.constants.FOOT_PAIRS` each of them becomes in a mirror, and whether its feet change
@@ -52,8 +52,9 @@ def stride_patterns(clips: Sequence[MotionClip]) -> TensorDict:
     Returns:
         ``[5]`` in the order of :data:`~agility_rl.behaviours.BEHAVIOURS`: ``frequency`` [Hz] at ``speed`` [m/s], and
         how it grows with that, ``growth`` [1/m]; ``share``, how much of the mean square of the feet's motion a sine of
-        that frequency is; ``phase`` and ``mirrored_phase`` ``[5, 6]`` [strides], in the order of
-        :data:`~agility_rl.go2.constants.FOOT_PAIRS`, how far the first foot is ahead of the second.
+        that frequency is; ``duty``, the share of time in which a foot stands; ``phase`` and ``mirrored_phase``
+        ``[5, 6]`` [strides], in the order of :data:`~agility_rl.go2.constants.FOOT_PAIRS`, how far the first foot is
+        ahead of the second.
 
     Raises:
         MotionError: if a behaviour has no clip.
@@ -77,15 +78,15 @@ def stride_patterns(clips: Sequence[MotionClip]) -> TensorDict:
             nearer = (total.conj() * image).real.sum() > (total.conj() * cross).real.sum()
             total = total + torch.where(nearer, image, cross)
         crosses.append(total)
-    whole, (frequency, speed, share) = torch.stack(crosses), torch.stack(figures, 1)
+    whole, (frequency, speed, share, duty) = torch.stack(crosses), torch.stack(figures, 1)
     growth = torch.tensor([FREQUENCY_GROWTH.get(name, 0.0) for name in BEHAVIOURS])
     phases = {"phase": whole.angle() / (2 * torch.pi), "mirrored_phase": mirrored(whole).angle() / (2 * torch.pi)}
-    pace = {"frequency": frequency, "speed": speed, "growth": growth, "share": share}
+    pace = {"frequency": frequency, "speed": speed, "growth": growth, "share": share, "duty": duty}
     return TensorDict({**pace, **phases}, [len(BEHAVIOURS)])
 
 
 def _spectrum(clip: MotionClip) -> tuple[Tensor, Tensor]:
-    """``[3]``, stride frequency [Hz], speed [m/s] and the share of a sine; cross-spectra ``[6]`` of length one."""
+    """``[4]``, frequency [Hz], speed [m/s], share of a sine, duty factor; cross-spectra ``[6]`` of length one."""
     swing = detrend(level_feet(clip)[..., 0].float())
     frequency, cross = stride_spectrum(swing, clip.dt)
     angle = 2 * torch.pi * frequency * clip.dt * torch.arange(len(swing))
@@ -93,4 +94,4 @@ def _spectrum(clip: MotionClip) -> tuple[Tensor, Tensor]:
     fitted = sines @ torch.linalg.lstsq(sines, swing).solution
     share = fitted.square().sum() / swing.square().sum()
     speed = clip.root_linear_velocity[:, :2].norm(dim=-1).mean()
-    return torch.stack((frequency, speed, share)), cross / cross.abs()
+    return torch.stack((frequency, speed, share, clip_stance_share(clip))), cross / cross.abs()

@@ -55,7 +55,7 @@ def test_control_step_prints_times_and_memory(repository: Path) -> None:
 @pytest.mark.slow
 def test_engines_prints_agreement_and_shares(repository: Path) -> None:
     options = (
-        "--controller=pretrained/bbc",
+        "--controller=pretrained/bbc_joined",
         "--robots=4",
         "--threads=1",
         "--episodes=1",

@@ -11,21 +11,25 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from agility_rl.envs.rewards import rhythm
-from agility_rl.envs.rhythm import MEMORY, SHARPNESS, Rhythm
+from agility_rl.envs.rhythm import MEMORY, SHARPNESS, STANCE_WIDTH, Rhythm
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants, kinematics
 
 TROT, PACE = torch.tensor([0.0, 0.5, 0.5, 0.0]), torch.tensor([0.0, 0.5, 0.0, 0.5])
+STANDING = torch.tensor([[0.0], [1000.0]])
+"""A trunk that stands and is said to be fast: no foot goes forward at half of that, each stands all of the time."""
 GALLOP = torch.tensor([0.0, 0.15, 0.5, 0.62])
 
 
-def pattern_of(ahead: Tensor, frequency: float, growth: float = 0.0, share: float = 1.0) -> TensorDict:
+def pattern_of(
+    ahead: Tensor, frequency: float, growth: float = 0.0, share: float = 1.0, duty: float = 1.0
+) -> TensorDict:
     """That of feet which are so many strides ahead at 1 m/s, for all behaviours."""
     pairs = [(ahead[i] - ahead[j]).item() for i, j in constants.FOOT_PAIRS]
     image = ahead[[1, 0, 3, 2]]
     turned = [(image[i] - image[j]).item() for i, j in constants.FOOT_PAIRS]
     phases = {"phase": torch.tensor([pairs] * 5), "mirrored_phase": torch.tensor([turned] * 5)}
-    figures = {"frequency": frequency, "speed": 1.0, "growth": growth, "share": share}
+    figures = {"frequency": frequency, "speed": 1.0, "growth": growth, "share": share, "duty": duty}
     return TensorDict({name: torch.full((5,), value) for name, value in figures.items()} | phases, [5])
 
 
@@ -43,7 +47,7 @@ def heard(
     told = torch.tensor([speed])
     for step in range(round(seconds / 0.02)):
         angle = 2.0 * math.pi * (frequency * 0.02 * step + ahead)
-        values.append(memory.hear(offset + amplitude * torch.cos(angle)[None], skill, told, 0.02))
+        values.append(memory.hear(offset + amplitude * torch.cos(angle)[None], STANDING, skill, told, 0.02))
     return float(torch.cat(values[-100:]).mean())
 
 
@@ -85,11 +89,25 @@ def test_motion_counts_beside_what_a_sine_is_of_the_dogs() -> None:
         memory, last = Rhythm(1, pattern_of(TROT, 2.0, share=share)), []
         for step in range(400):
             angle = 2.0 * math.pi * (2.0 * 0.02 * step + TROT)
-            last.append(memory.hear(0.2 * (angle.cos() + (3.0 * angle).cos())[None], skill, speed, 0.02))
+            last.append(memory.hear(0.2 * (angle.cos() + (3.0 * angle).cos())[None], STANDING, skill, speed, 0.02))
         values.append(float(torch.cat(last[-100:]).mean()))
     assert values[0] == pytest.approx(0.5, abs=0.06)
     assert values[1] == pytest.approx(values[0] / 0.75, abs=0.03)
     assert 0.9 < values[2] <= 1.0
+
+
+@pytest.mark.parametrize("duty", [0.7, 0.6, 0.45])
+def test_feet_that_stand_too_long_or_too_short_lose_by_a_bell_curve(duty: float) -> None:
+    """A foot that goes back at the trunk's speed stands; of each stride here 0.7, saw teeth at 1 m/s."""
+    skill, speed, values = torch.zeros(1, dtype=torch.int64), torch.ones(1), {}
+    for wanted in (0.7, duty):
+        memory, last = Rhythm(1, pattern_of(TROT, 2.0, share=0.5, duty=wanted)), []
+        for step in range(2000):
+            phase = torch.remainder(2.0 * 0.004 * step + TROT, 1.0)
+            swing = torch.where(phase < 0.7, 0.175 - 0.5 * phase, -0.175 + 0.35 * (phase - 0.7) / 0.3)
+            last.append(memory.hear(swing[None], torch.ones(2, 1), skill, speed, 0.004))
+        values[wanted] = float(torch.cat(last[-500:]).mean())
+    assert values[duty] / values[0.7] == pytest.approx(math.exp(-(((0.7 - duty) / STANCE_WIDTH) ** 2)), abs=0.05)
 
 
 def test_feet_out_of_phase_lose_their_pairs() -> None:
@@ -109,8 +127,8 @@ def test_robots_are_heard_apart_and_a_new_episode_knows_nothing_of_the_last() ->
         if step == 100:
             memory.begin(torch.tensor([False, True]))
             alone = Rhythm(1, pattern)
-        both = memory.hear(torch.cos(angle), skill, speed, 0.02)
-        single = alone.hear(torch.cos(angle[1:]), skill[1:], speed[1:], 0.02)
+        both = memory.hear(torch.cos(angle), STANDING.expand(2, 2), skill, speed, 0.02)
+        single = alone.hear(torch.cos(angle[1:]), STANDING, skill[1:], speed[1:], 0.02)
     torch.testing.assert_close(both[1:], single)
     assert both[0] > 0.8
 
@@ -120,10 +138,12 @@ def test_a_saved_memory_goes_on_exactly() -> None:
     one, other = Rhythm(1, pattern), Rhythm(1, pattern)
     positions = torch.randn(40, 1, 4, generator=torch.Generator().manual_seed(0))
     for position in positions[:20]:
-        one.hear(position, skill, speed, 0.02)
+        one.hear(position, STANDING, skill, speed, 0.02)
     other.load_state_dict(one.state_dict())
     for position in positions[20:]:
-        assert torch.equal(one.hear(position, skill, speed, 0.02), other.hear(position, skill, speed, 0.02))
+        assert torch.equal(
+            one.hear(position, STANDING, skill, speed, 0.02), other.hear(position, STANDING, skill, speed, 0.02)
+        )
 
 
 def test_the_feet_are_those_of_the_joints_in_a_level_frame(neutral: Callable[..., LocomotionState]) -> None:
@@ -137,10 +157,12 @@ def test_the_feet_are_those_of_the_joints_in_a_level_frame(neutral: Callable[...
             * torch.tensor([0, 1, 0] * 4)
         )
         pitch = torch.full((1,), 0.1 * math.sin(0.3 * step))
-        command = torch.tensor([[0.3, -0.4, 1.0, 0.0, 0.3]])
-        state = neutral(1, joint_position=(pose + swing)[None], pitch=pitch, command=command)
+        told = {"command": torch.tensor([[0.3, -0.4, 1.0, 0.0, 0.3]])}
+        goes = {"linear_velocity": torch.tensor([[0.4, 9.0, 9.0]]), "mean_velocity": torch.tensor([[0.6, 9.0, 9.0]])}
+        state = neutral(1, joint_position=(pose + swing)[None], pitch=pitch, **told, **goes)
         turn = torch.tensor([[pitch.cos(), 0.0, pitch.sin()], [0.0, 1.0, 0.0], [-pitch.sin(), 0.0, pitch.cos()]])
         level = kinematics.forward(pose + swing) @ turn.T
-        by_hand = hands.hear(level[None, :, 0], skill, torch.tensor([0.5]), state.dt)
+        forward, speed = torch.tensor([[0.4], [0.6]]), torch.tensor([0.5])
+        by_hand = hands.hear(level[None, :, 0], forward, skill, speed, state.dt)
         torch.testing.assert_close(joints.update(state, skill), by_hand)
     assert torch.equal(rhythm(neutral(1, rhythm=torch.tensor([0.3]))), torch.tensor([0.3]))

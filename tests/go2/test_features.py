@@ -115,3 +115,9 @@ def test_frames_do_not_depend_on_yaw() -> None:
         *rest,
     )
     torch.testing.assert_close(straight, turned, atol=1e-6, rtol=0)
+
+
+def test_a_foot_stands_that_is_slower_than_half_of_the_trunk_or_than_a_tenth_of_a_metre_a_second() -> None:
+    foot = torch.tensor([-0.5, 0.09, 0.11, 0.7, 0.8])
+    assert features.in_stance(foot, torch.tensor(1.5)).tolist() == [True, True, True, True, False]
+    assert features.in_stance(foot, torch.tensor(-1.0)).tolist() == [True, True, False, False, False]

@@ -198,3 +198,9 @@ def test_names_that_lie_do_not_mislead(data: Path) -> None:
     lying = data / "a1_metalhead" / "mocap_motions_jump_cmd" / "trot_forward0.json"
     windows = gait.measure_clip(load_clip(lying), window=3.0)
     assert gait.GAIT_LABELS[int(gait.classify_episodes(windows)[0])] == "pace"
+
+
+@pytest.mark.parametrize("name", gait.BEHAVIOURS)
+def test_stance_share_is_the_planned_duty_of_synthetic_gaits(name: str) -> None:
+    clip = synthesize_gait(name, yaw_rate=0.3)
+    assert gait.clip_stance_share(clip) == pytest.approx(float(clip.foot_contact.float().mean()), abs=0.09)

@@ -20,6 +20,7 @@ def test_patterns_are_what_the_gait_measurement_finds() -> None:
         found, phase = measure_clip(clip), patterns["phase"][index].abs()
         torch.testing.assert_close(patterns["frequency"][index], found.stride_frequency)
         torch.testing.assert_close(patterns["speed"][index], found.speed, atol=0.02, rtol=0.02)
+        torch.testing.assert_close(patterns["duty"][index], found.duty.mean(), atol=0.09, rtol=0)
         torch.testing.assert_close(phase[0], found.phase_left_right_front)
         torch.testing.assert_close(phase[2:4].mean(), found.phase_lateral)
         torch.testing.assert_close(phase[4:].mean(), found.phase_diagonal)

@@ -90,16 +90,6 @@ def test_motion_needs_labels(evaluate: ModuleType) -> None:
         evaluate.load_motion(evaluate.MotionConfig(unlabelled=Path("anywhere")), {}, 0)
 
 
-@pytest.mark.parametrize("name", BEHAVIOURS)
-def test_stance_share_is_the_planned_duty_of_synthetic_gaits(name: str, evaluate: ModuleType) -> None:
-    clip = synthesize_gait(name, yaw_rate=0.3)
-    heading = rotations.heading(clip.root_quaternion)
-    feet = rotations.rotate_inverse(heading[:, None], clip.foot_position - clip.root_position[:, None])
-    velocity = rotations.rotate_inverse(heading, clip.root_linear_velocity)
-    share = evaluate.stance_share(feet, velocity, clip.root_angular_velocity[:, 2])
-    assert share == pytest.approx(float(clip.foot_contact.float().mean()), abs=0.09)
-
-
 def test_gaits_of_robots_are_named_and_a_fall_is_no_gait(evaluate: ModuleType) -> None:
     clips = [synthesize_gait(name, duration=4.0) for name in (*BEHAVIOURS, "trot")]
     heading = [rotations.heading(clip.root_quaternion) for clip in clips]
