@@ -13,6 +13,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import mujoco.batch
@@ -23,8 +24,11 @@ from torch import Tensor
 from agility_rl import keys
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.randomization import Randomization
+from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm, rhythm, velocity_progress
 from agility_rl.go2 import constants
 from agility_rl.go2.model import build_spec
+from agility_rl.motion.gaits import synthetic_dataset_clips
+from agility_rl.motion.stride_patterns import stride_patterns
 from agility_rl.simulation import make_simulator
 
 SIM_DT, CONTROL_DT = 0.005, 0.02
@@ -66,9 +70,18 @@ def simulator(robots: int, threads: int) -> Callable[[Tensor], None]:
     return simulation.step
 
 
-def environment(robots: int, threads: int, full: bool, resets: bool) -> Callable[[Tensor], None]:
-    """The environment: observations, rewards, commands; ``full`` adds noise, randomisation and pushes."""
-    options = {"randomization": Randomization(), "observation_noise": 1.0, "push_interval": 8.0} if full else {}
+def as_trained() -> dict[str, Any]:
+    """What the preset ``cpu`` of ``recipes/bbc_pretrain.py`` adds: half a second of motion, speed and rhythm."""
+    terms = {"velocity_progress": RewardTerm(8.0, velocity_progress), "rhythm": RewardTerm(20.0, rhythm)}
+    return {
+        "motion_offsets": (0, 8, 16, 23, 24),
+        "patterns": stride_patterns(synthetic_dataset_clips(0)[0]),
+        "rewards": LOCOMOTION_REWARDS | terms,
+    }
+
+
+def environment(robots: int, threads: int, resets: bool = False, **options: Any) -> Callable[[Tensor], None]:
+    """The environment: observations, rewards, commands."""
     env = LocomotionEnv(
         robots,
         simulator_options={"num_threads": threads, "sim_dt": SIM_DT, "control_dt": CONTROL_DT},
@@ -98,12 +111,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=25, help="control steps a turn")
     options = parser.parse_args()
     robots, threads = options.robots, options.threads
+    disturbed = {"randomization": Randomization(), "observation_noise": 1.0, "push_interval": 8.0}
     contenders = {
         "bare Batch.step": bare(robots, threads),
         "simulator": simulator(robots, threads),
-        "env.step": environment(robots, threads, full=False, resets=False),
-        "env.step, noise, randomised, pushed": environment(robots, threads, full=True, resets=False),
-        "the same with resets": environment(robots, threads, full=True, resets=True),
+        "env.step": environment(robots, threads),
+        "env.step, as the preset cpu trains": environment(robots, threads, **as_trained()),
+        "env.step, noise, randomised, pushed": environment(robots, threads, **disturbed),
+        "the same with resets": environment(robots, threads, resets=True, **disturbed),
     }
     generator = torch.Generator().manual_seed(0)
     # Robots that shift their weight about the default pose: all contenders keep four feet on the ground.

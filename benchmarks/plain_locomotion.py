@@ -68,7 +68,7 @@ class PlainLocomotion:
             keys.HISTORY: env.observations.history,
             keys.COMMAND: env.commands.vector(),
             keys.PEAK: (state.peak_height * env.commands.jumping)[:, None],
-            keys.MOTION: env.observations.motion[:, env.observations.motion_offsets],
+            keys.MOTION: env.observations.motion(),
             keys.SKILL: env.commands.skill,
             keys.SHIFT: env.commands.shift,
         }

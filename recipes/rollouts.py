@@ -25,8 +25,8 @@ from agility_rl.motion import MotionClip, MotionDataset, load_clips
 from agility_rl.motion.clip import contacts
 from agility_rl.motion.gaits import synthetic_dataset_clips
 
-Schedule = Sequence[tuple[int, Tensor, Tensor]]
-"""Pieces of (steps, skill ``[N]``, command ``[N, 5]``)."""
+Schedule = Sequence[tuple[int, Tensor, Tensor] | tuple[int, Tensor, Tensor, Tensor]]
+"""Pieces of (steps, skill ``[N]``, command ``[N, 5]``), with a shift ``[N, 1]`` where it is not zero."""
 STATES_A_SKILL = 2000
 
 
@@ -153,8 +153,8 @@ def drive(bbc: BasicBehaviourController, env: LocomotionEnv, schedule: Schedule)
     policy = bbc.deployable_policy()
     env.set_commands(*schedule[0][1:])
     td = env.reset()
-    for steps, skill, command in schedule:
-        env.set_commands(skill, command)
+    for steps, *told in schedule:
+        env.set_commands(*told)
         for _ in range(steps):
             with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
                 td = env.step(policy(td))["next"]

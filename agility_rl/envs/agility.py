@@ -29,7 +29,7 @@ from agility_rl.envs.progress import GOAL_RADIUS, Events
 from agility_rl.envs.randomization import Randomization
 from agility_rl.envs.robots import Pushes, Robots
 from agility_rl.envs.scandots import NUM_SCANDOTS
-from agility_rl.go2 import camera, features, kinematics
+from agility_rl.go2 import camera, features
 from agility_rl.simulation import Simulator, make_simulator
 
 Controller = Callable[[TensorDictBase], TensorDictBase]
@@ -292,7 +292,7 @@ class AgilityEnv(EnvBase):
         position = simulator.root_position
         goal, heading_error = self.arena.heading_error(position[:, :2], robot.yaw)
         distance = torch.linalg.vector_norm(goal, dim=-1)
-        feet = rotations.rotate(simulator.root_quaternion[:, None], kinematics.forward(robot.joint_position))
+        feet = rotations.rotate(simulator.root_quaternion[:, None], robot.feet)
         return AgilityState(
             robot=robot,
             position=position,

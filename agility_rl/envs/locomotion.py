@@ -15,7 +15,7 @@ from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.observations import ObservationGroups
 from agility_rl.envs.randomization import Randomization, uniform
-from agility_rl.envs.reference import PAST, ReferenceStates
+from agility_rl.envs.reference import ReferenceStates
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm
 from agility_rl.envs.rhythm import Rhythm
 from agility_rl.envs.robots import CLEARANCE, Pushes, Robots
@@ -206,11 +206,9 @@ class LocomotionEnv(EnvBase):
         state = self.robots.state(action, self.commands)
         if self.rhythm is not None:
             state.rhythm = self.rhythm.update(state, self.commands.skill)
-        terms = {
-            name: (term.weight * self.dt * term.function(state)).masked_fill(state.unstable, 0.0)[:, None]
-            for name, term in self.rewards.items()
-        }
-        reward = torch.cat(tuple(terms.values()), -1).sum(-1, keepdim=True).clamp(min=0.0)
+        terms = torch.stack([term.weight * self.dt * term.function(state) for term in self.rewards.values()], -1)
+        terms = terms.masked_fill(state.unstable[:, None], 0.0)
+        reward = terms.sum(-1, keepdim=True).clamp(min=0.0)
         terminated = torch.stack([failed(state) for failed in self.terminations]).any(0)[:, None]
         truncated = ((self._step_count >= self.max_steps) | self._at_edge())[:, None] & ~terminated
 
@@ -221,13 +219,15 @@ class LocomotionEnv(EnvBase):
         observation["reward"] = reward
         observation["terminated"], observation["truncated"] = terminated, truncated
         observation["done"] = terminated | truncated
-        observation[keys.REWARD_TERMS] = TensorDict(terms, self.batch_size)
+        by_name = dict(zip(self.rewards, terms.split(1, -1), strict=True))
+        observation[keys.REWARD_TERMS] = TensorDict(by_name, self.batch_size)
         return observation
 
     # -- physics -----------------------------------------------------------------------------------------------------
     def _place(self, mask: Tensor) -> Tensor | None:
         n = self.num_robots
-        start = self.reference.sample(self.commands.skill, self.generator)
+        number = self.reference.draw(self.commands.skill, self.generator)
+        start, past = self.reference.states[number], self.reference.past_motion
         yaw = uniform((n,), (0.0, 2.0 * torch.pi), self.generator)
         turn = rotations.from_euler(torch.zeros_like(yaw), torch.zeros_like(yaw), yaw)
         place = self.simulator.ground_extent * uniform((n, 2), (-1.0, 1.0), self.generator)
@@ -241,7 +241,7 @@ class LocomotionEnv(EnvBase):
             joint_position=start["joint_position"],
             joint_velocity=start["joint_velocity"],
         )
-        return start.get(PAST, None)
+        return None if past is None else past[number[mask]]
 
     def _at_edge(self) -> Tensor:
         """Who has come to the edge of a height field, beyond which there is nothing to walk on."""

@@ -16,6 +16,49 @@ from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import features
 
 
+class RecentFrames:
+    """The newest frames of ``N`` robots, in a ring: a step writes one frame and moves none.
+
+    Args:
+        num_robots: N.
+        span: number of frames S.
+        size: entries of a frame F.
+        device: where they are kept.
+
+    Example:
+        >>> frames = RecentFrames(num_robots=1, span=3, size=1, device="cpu")
+        >>> for number in (1.0, 2.0, 3.0, 4.0):
+        ...     frames.push(torch.tensor([[number]]))
+        >>> frames.read(torch.tensor([0, 2])).tolist()  # the oldest and the newest
+        [[[2.0], [4.0]]]
+    """
+
+    def __init__(self, num_robots: int, span: int, size: int, device: torch.device | str) -> None:
+        self._ring = torch.zeros(num_robots, span, size, device=device)
+        self._oldest = 0
+
+    def push(self, frame: Tensor) -> None:
+        """Take ``[N, F]`` as the newest frame and forget the oldest."""
+        self._ring[:, self._oldest] = frame
+        self._oldest = (self._oldest + 1) % self._ring.shape[1]
+
+    def fill(self, mask: Tensor, frames: Tensor) -> None:
+        """Replace those of the K rows of a bool mask ``[N]`` by ``[K, S, F]``, oldest first."""
+        self._ring[mask] = frames.roll(self._oldest, 1)
+
+    def read(self, offsets: Tensor) -> Tensor:
+        """A copy ``[N, O, F]`` of the frames so many steps after the oldest, int64 ``[O]``."""
+        return self._ring.index_select(1, (offsets + self._oldest) % self._ring.shape[1])
+
+    def all(self) -> Tensor:
+        """A copy ``[N, S, F]``, oldest first."""
+        return self._ring.roll(-self._oldest, 1)
+
+    def restore(self, frames: Tensor) -> None:
+        """Take back what :meth:`all` returned."""
+        self._ring, self._oldest = frames.clone(), 0
+
+
 class ObservationGroups:
     """Builds the named observations of ``N`` robots from their state.
 
@@ -42,7 +85,7 @@ class ObservationGroups:
         self.history = torch.zeros(num_robots, features.HISTORY, features.NUM_PROPRIOCEPTION, device=device)
         features.check_motion_offsets(motion_offsets)
         self.motion_offsets = torch.tensor(motion_offsets, device=device)
-        self.motion = torch.zeros(num_robots, motion_offsets[-1] + 1, features.NUM_MOTION, device=device)
+        self._motion = RecentFrames(num_robots, motion_offsets[-1] + 1, features.NUM_MOTION, device)
         self.touched = torch.zeros(num_robots, 4, dtype=torch.bool, device=device)
 
     def reset(self, mask: Tensor, state: LocomotionState, past: Tensor | None = None) -> None:
@@ -51,16 +94,16 @@ class ObservationGroups:
         Args:
             mask: the rows.
             state: the present.
-            past: ``[N, span, 49]``, frames of the recorded motion that led here, for discriminators that look back.
+            past: ``[K, span, 49]`` of the K rows, frames of the recorded motion that led here, for discriminators
+                that look back.
         """
         touched = state.foot_contact > features.FOOT_CONTACT_FORCE
         row = mask[:, None]
         self.touched = torch.where(row, touched, self.touched)
         self.history = torch.where(row[..., None], self._measure(state, touched)[:, None], self.history)
-        motion = _motion_frame(state)[:, None]
-        if past is not None:
-            motion = torch.cat((past, motion), 1)
-        self.motion = torch.where(row[..., None], motion, self.motion)
+        present = _motion_frame(state)[mask, None]
+        past = present.expand(-1, int(self.motion_offsets[-1]), -1) if past is None else past
+        self._motion.fill(mask, torch.cat((past, present), 1))
 
     def update(self, state: LocomotionState) -> None:
         """Append the present to the memories of every robot."""
@@ -68,7 +111,11 @@ class ObservationGroups:
         measured = self._measure(state, touched | self.touched)
         self.touched = touched
         self.history = torch.cat((self.history[:, 1:], measured[:, None]), 1)
-        self.motion = torch.cat((self.motion[:, 1:], _motion_frame(state)[:, None]), 1)
+        self._motion.push(_motion_frame(state))
+
+    def motion(self) -> Tensor:
+        """A copy of the discriminator frames ``[N, H, 49]``, oldest first."""
+        return self._motion.read(self.motion_offsets)
 
     def build(self, state: LocomotionState, commands: CommandSampler, privileged: Tensor) -> TensorDict:
         """All observation groups, ``[N]``."""
@@ -81,7 +128,7 @@ class ObservationGroups:
                 keys.HISTORY: self.history,
                 keys.COMMAND: commands.vector(),
                 keys.PEAK: (state.peak_height * commands.jumping)[:, None],
-                keys.MOTION: self.motion[:, self.motion_offsets],
+                keys.MOTION: self.motion(),
                 keys.SKILL: commands.skill,
                 keys.SHIFT: commands.shift,
             },
@@ -103,12 +150,12 @@ class ObservationGroups:
 
     def state_dict(self) -> dict[str, Any]:
         """The memories."""
-        return {name: getattr(self, name).clone() for name in ("history", "motion", "touched")}
+        return {"history": self.history.clone(), "motion": self._motion.all(), "touched": self.touched.clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        for name, value in state.items():
-            setattr(self, name, value.clone())
+        self.history, self.touched = state["history"].clone(), state["touched"].clone()
+        self._motion.restore(state["motion"])
 
 
 def _motion_frame(state: LocomotionState) -> Tensor:
@@ -120,4 +167,5 @@ def _motion_frame(state: LocomotionState) -> Tensor:
         state.angular_velocity,
         state.joint_position,
         state.joint_velocity,
+        state.feet,
     )

@@ -67,13 +67,18 @@ class ReferenceStates:
             ``root_linear_velocity``, ``root_angular_velocity`` [M, 3] (world frame), ``joint_position``,
             ``joint_velocity`` [M, 12]; optionally ``past_motion`` [M, span, 49], the discriminator frames before.
 
+    Attributes:
+        states: ``[M]``, sorted, without the frames before.
+        past_motion: those, ``[M, span, 49]``, or ``None``.
+
     Raises:
         ValueError: if an entry is missing or a behaviour has no state.
 
     Example:
-        >>> states = ReferenceStates.standing()
-        >>> states.sample(torch.tensor([0, 4]), torch.Generator())["joint_position"].shape
-        torch.Size([2, 12])
+        >>> reference = ReferenceStates.standing()
+        >>> number = reference.draw(torch.tensor([0, 4]), torch.Generator())
+        >>> number.tolist(), reference.states[number]["joint_position"].shape
+        ([0, 4], torch.Size([2, 12]))
     """
 
     def __init__(self, states: TensorDictBase) -> None:
@@ -85,7 +90,10 @@ class ReferenceStates:
         if empty:
             raise ValueError(f"no reference state for {', '.join(empty)}; give at least one for each behaviour")
         self.first = torch.cumsum(self.count, 0) - self.count
-        self.states = states.select(*STATE_ENTRIES, PAST, strict=False)[torch.argsort(states["skill"], stable=True)]
+        by_skill = torch.argsort(states["skill"], stable=True)
+        self.states = states.select(*STATE_ENTRIES)[by_skill]
+        past = states.get(PAST, None)
+        self.past_motion: Tensor | None = None if past is None else past[by_skill]
 
     def check_past(self, span: int) -> None:
         """Refuse states whose past is not of ``span`` frames; states without a past are welcome.
@@ -93,10 +101,9 @@ class ReferenceStates:
         Raises:
             ValueError: if it is of another length.
         """
-        past = self.states.get(PAST, None)
-        if past is not None and past.shape[1] != span:
+        if self.past_motion is not None and self.past_motion.shape[1] != span:
             raise ValueError(
-                f"the reference states bring {past.shape[1]} past motion frames, expected {span}; "
+                f"the reference states bring {self.past_motion.shape[1]} past motion frames, expected {span}; "
                 "give dataset and environment the same motion offsets"
             )
 
@@ -105,7 +112,7 @@ class ReferenceStates:
         """One state for all behaviours: standing in the default pose."""
         return cls(standing_states(torch.arange(behaviours.NUM_BEHAVIOURS, device=device)))
 
-    def sample(self, skill: Tensor, generator: torch.Generator) -> TensorDictBase:
-        """A random state of each given skill, ``[N]``."""
+    def draw(self, skill: Tensor, generator: torch.Generator) -> Tensor:
+        """The numbers int64 ``[N]`` of a random state of each given skill."""
         fraction = torch.rand(skill.shape, generator=generator, device=skill.device)
-        return self.states[self.first[skill] + (fraction * self.count[skill]).long()]
+        return self.first[skill] + (fraction * self.count[skill]).long()

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from agility_rl.envs.state import LocomotionState
-from agility_rl.go2 import constants, kinematics
+from agility_rl.go2 import constants
 from agility_rl.go2.features import in_stance
 
 MEMORY = 0.6
@@ -25,15 +25,16 @@ STANCE_WIDTH = 0.15
 SHARPNESS = 8.0
 """Of the agreement between phases: a twelfth of a stride aside counts a third."""
 
-_IMAGES = ("phase", "mirrored_phase")
+_FIGURES = ("frequency", "duty", "speed", "frequency_growth", "duty_growth", "share")
 _REAL = ("power", "mean", "last", "stance", "fresh")
 
 
 class Rhythm:
     r"""Short memory of the fore-aft motion of the feet, and how much of it follows a dog's pattern.
 
-    A resonator at the behaviour's stride frequency :math:`f = f_0 + g\,(|v^*| - v_0)`, at least :math:`f_0 / 2`,
-    follows each foot's fore-aft position x about its mean,
+    Told to go at :math:`v^*`, a dog of that behaviour strides at :math:`f = f_0 + g_f\,(|v^*| - v_0)`, at least
+    :math:`f_0 / 2`, and each of its feet stands for a share :math:`d^* = d_0 + g_d\,(|v^*| - v_0)` of the time. A
+    resonator at f follows each foot's fore-aft position x about its mean,
 
     .. math:: \dot z_i = \left(2 \pi i f - \tfrac{f}{0.6}\right) z_i + \tfrac{f}{0.6}\,(x_i - \bar x_i),
 
@@ -52,13 +53,15 @@ class Rhythm:
 
     Args:
         num_robots: N.
-        patterns: ``[5]`` with ``frequency`` [Hz] :math:`f_0`, ``speed`` [m/s] :math:`v_0`, ``growth`` [1/m] g,
-            ``share`` s, ``duty`` :math:`d^*`, ``phase`` and ``mirrored_phase`` [5, 6] [strides], as
+        patterns: ``[5]`` with ``frequency`` [Hz] :math:`f_0`, ``duty`` :math:`d_0`, ``speed`` [m/s] :math:`v_0`,
+            ``frequency_growth`` [1/m] :math:`g_f`, ``duty_growth`` [s/m] :math:`g_d`, ``share`` s, ``phase`` and
+            ``mirrored_phase`` [5, 6] [strides], as
             :func:`agility_rl.motion.stride_patterns.stride_patterns` makes them; where it is, the tensors are.
 
     Example:
         >>> from tensordict import TensorDict
-        >>> pattern = {name: torch.ones(5) for name in ("frequency", "speed", "growth", "share")}
+        >>> pattern = {name: torch.ones(5) for name in ("frequency", "speed", "share")}
+        >>> pattern |= {name: torch.zeros(5) for name in ("frequency_growth", "duty_growth")}
         >>> pattern |= {"duty": torch.full((5,), 0.5), "phase": torch.zeros(5, 6), "mirrored_phase": torch.zeros(5, 6)}
         >>> rhythm = Rhythm(1, TensorDict(pattern, [5]))
         >>> trot = torch.tensor([2])
@@ -70,8 +73,9 @@ class Rhythm:
     """
 
     def __init__(self, num_robots: int, patterns: TensorDictBase) -> None:
-        self.patterns = patterns
         device = patterns["frequency"].device
+        self._figures = torch.stack([patterns[name] for name in _FIGURES], -1)  # [5, 6]
+        self._images = torch.stack([patterns[name] for name in ("phase", "mirrored_phase")], 1)  # [5, 2, 6]
         self._swing = torch.zeros(num_robots, 4, dtype=torch.complex64, device=device)
         self._power, self._mean = (torch.zeros(num_robots, 4, device=device) for _ in range(2))
         self._last, self._stance = torch.zeros(num_robots, 4, device=device), torch.zeros(num_robots, device=device)
@@ -85,23 +89,23 @@ class Rhythm:
 
     def update(self, state: LocomotionState, skill: Tensor) -> Tensor:
         """Follow the feet for one control step, in behaviours int64 ``[N]``; returns the agreement ``[N]``, 0 to 1."""
-        feet = kinematics.forward(state.joint_position)
-        level = feet[..., 0] * state.pitch.cos()[:, None] + feet[..., 2] * state.pitch.sin()[:, None]
+        cosine, sine = state.pitch.cos()[:, None], state.pitch.sin()[:, None]
+        level = state.feet[..., 0] * cosine + state.feet[..., 2] * sine
         forward = torch.stack((state.linear_velocity[:, 0], state.mean_velocity[:, 0]))
         return self.hear(level, forward, skill, state.command[:, :2].norm(dim=-1), state.dt)
 
     def hear(self, position: Tensor, forward: Tensor, skill: Tensor, speed: Tensor, dt: float) -> Tensor:
         """The same, of fore-aft positions ``[N, 4]`` [m] of the feet, ``dt`` [s] after the last ones; the trunk goes
         ``forward`` ``[2, N]`` [m/s], now and on the mean, and is told to go at speeds ``[N]`` [m/s]."""
-        pattern = self.patterns[skill]
-        usual = pattern["frequency"]
-        faster = pattern["growth"] * (speed - pattern["speed"])
-        step = dt * torch.maximum(usual + faster, 0.5 * usual)[:, None]
+        usual, usual_duty, usual_speed, frequency_growth, duty_growth, dogs_share = self._figures[skill].unbind(-1)
+        faster = speed - usual_speed
+        step = dt * torch.maximum(usual + frequency_growth * faster, 0.5 * usual)[:, None]
+        duty = usual_duty + duty_growth * faster
         self._swing = self._swing.masked_fill(self._fresh, 0.0)
         self._power = self._power.masked_fill(self._fresh, 0.0)
         mean = torch.where(self._fresh, position, self._mean)
         last = torch.where(self._fresh, position, self._last)
-        stance = torch.where(self._fresh[:, 0], pattern["duty"], self._stance)
+        stance = torch.where(self._fresh[:, 0], duty, self._stance)
         self._fresh, self._last = torch.zeros_like(self._fresh), position
         now, usually = forward[..., None]
         standing = in_stance((position - last) / dt + now, usually).float().mean(-1)
@@ -111,15 +115,12 @@ class Rhythm:
         turn = torch.polar(torch.exp(-step / MEMORY), 2.0 * math.pi * step)
         self._swing = self._swing * turn + aside * step / MEMORY
         self._power = self._power + (aside.square() - self._power) * step / (2.0 * MEMORY)
-        share = 2.0 * self._swing.abs().square().mean(-1) / (self._power.mean(-1) + REST**2) / pattern["share"]
+        share = 2.0 * self._swing.abs().square().mean(-1) / (self._power.mean(-1) + REST**2) / dogs_share
         phase = self._swing[:, self._first] * self._swing[:, self._second].conj()
-        agreement = torch.stack([self._agreement(phase, pattern[name]) for name in _IMAGES])
-        miss = (self._stance - pattern["duty"]) / STANCE_WIDTH
-        return share.clamp(max=1.0) * agreement.amax(0) * torch.exp(-miss.square())
-
-    @staticmethod
-    def _agreement(cross: Tensor, phase: Tensor) -> Tensor:
-        return torch.exp(SHARPNESS * (torch.cos(cross.angle() - 2.0 * math.pi * phase) - 1.0)).mean(-1)
+        off = phase.angle()[:, None] - 2.0 * math.pi * self._images[skill]
+        agreement = torch.exp(SHARPNESS * (torch.cos(off) - 1.0)).mean(-1)
+        miss = (self._stance - duty) / STANCE_WIDTH
+        return share.clamp(max=1.0) * agreement.amax(-1) * torch.exp(-miss.square())
 
     def state_dict(self) -> dict[str, Any]:
         """The memory: ``swing [N, 4, 2]``, real and imaginary part [m]; ``power`` [m^2], ``mean`` and ``last`` [m]

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from torch import Tensor
+
+from agility_rl.go2 import kinematics
 
 
 @dataclass
@@ -66,3 +69,8 @@ class LocomotionState:
     rhythm: Tensor
     unstable: Tensor
     dt: float
+
+    @cached_property
+    def feet(self) -> Tensor:
+        """Centres of the feet ``[N, 4, 3]`` [m], base frame; computed once, whoever asks."""
+        return kinematics.forward(self.joint_position)

@@ -196,10 +196,10 @@ def explicit(root_height: Tensor, linear_velocity: Tensor) -> Tensor:
     return torch.cat((root_height, linear_velocity * LINEAR_VELOCITY_SCALE), -1)
 
 
-def feet_in_heading_frame(roll: Tensor, pitch: Tensor, joint_position: Tensor) -> Tensor:
-    """Foot-sphere centres relative to the trunk, turned upright but not by the yaw: ``[*B, 4, 3]`` [m]."""
+def in_heading_frame(roll: Tensor, pitch: Tensor, feet: Tensor) -> Tensor:
+    """Feet ``[*B, 4, 3]`` [m] of the base frame, turned upright but not by the yaw."""
     level = rotations.from_euler(roll, pitch, torch.zeros_like(roll))
-    return rotations.rotate(level[..., None, :], kinematics.forward(joint_position))
+    return rotations.rotate(level[..., None, :], feet)
 
 
 def motion_frame(
@@ -224,7 +224,7 @@ def motion_frame(
         angular_velocity: ``[*B, 3]`` [rad/s], base frame.
         joint_position: ``[*B, 12]`` [rad].
         joint_velocity: ``[*B, 12]`` [rad/s].
-        feet: result of :func:`feet_in_heading_frame` if the caller has it already.
+        feet: result of :func:`~agility_rl.go2.kinematics.forward` if the caller has it already.
 
     Returns:
         ``[*B, 49]`` laid out as :data:`MOTION_LAYOUT`.
@@ -235,8 +235,7 @@ def motion_frame(
         >>> motion_frame(torch.tensor([0.29]), zero, zero, torch.zeros(3), torch.zeros(3), pose, torch.zeros(12)).shape
         torch.Size([49])
     """
-    if feet is None:
-        feet = feet_in_heading_frame(roll, pitch, joint_position)
+    feet = in_heading_frame(roll, pitch, kinematics.forward(joint_position) if feet is None else feet)
     contact = (root_height + feet[..., 2] - constants.FOOT_RADIUS) < CONTACT_HEIGHT
     default = constant(constants.DEFAULT_POSE, joint_position.device, joint_position.dtype)
     return torch.cat(

@@ -292,12 +292,11 @@ def measure_clip(clip: MotionClip, window: float | None = None) -> GaitMeasureme
     return measure_gait(*stretch, dt=clip.dt) if window is None else measure_windows(*stretch, clip.dt, window)
 
 
-def stance_share(feet: Tensor, velocity: Tensor, yaw_rate: Tensor, dt: float) -> Tensor:
-    """Duty factor ``[*B]``: share of time in which a foot goes forward over the ground at less than half of the trunk's
-    speed, mean of the feet.
+def stance(feet: Tensor, velocity: Tensor, yaw_rate: Tensor, dt: float) -> Tensor:
+    """When a foot stands, bool ``[*B, T, 4]``: it goes forward over the ground at less than half of the trunk's speed.
 
     Feet of retargeted dogs hover or sink by centimetres, so heights and forces would not measure dog and robot alike;
-    on the synthetic gaits, whose contacts are known, this is right to 0.06.
+    on the synthetic gaits, whose contacts are known, their share of the time is right to 0.06.
 
     Args:
         feet: ``[*B, T, 4, 3]`` [m] relative to the trunk, heading frame.
@@ -306,14 +305,24 @@ def stance_share(feet: Tensor, velocity: Tensor, yaw_rate: Tensor, dt: float) ->
         dt: seconds between frames.
     """
     foot = torch.gradient(feet[..., 0], spacing=dt, dim=-2)[0] + velocity[..., :1] - yaw_rate[..., None] * feet[..., 1]
-    return in_stance(foot, velocity[..., :1].mean(-2, keepdim=True)).float().mean((-1, -2))
+    return in_stance(foot, velocity[..., :1].mean(-2, keepdim=True))
+
+
+def clip_stance(clip: MotionClip) -> Tensor:
+    """:func:`stance` of a clip, ``[T, 4]``."""
+    heading = rotations.heading(clip.root_quaternion)
+    velocity = rotations.rotate_inverse(heading, clip.root_linear_velocity)
+    return stance(level_feet(clip), velocity, clip.root_angular_velocity[:, 2], clip.dt)
+
+
+def stance_share(feet: Tensor, velocity: Tensor, yaw_rate: Tensor, dt: float) -> Tensor:
+    """Duty factor ``[*B]``: share of time in which a foot stands by :func:`stance`, mean of the feet."""
+    return stance(feet, velocity, yaw_rate, dt).float().mean((-1, -2))
 
 
 def clip_stance_share(clip: MotionClip) -> Tensor:
     """:func:`stance_share` of a clip."""
-    heading = rotations.heading(clip.root_quaternion)
-    velocity = rotations.rotate_inverse(heading, clip.root_linear_velocity)
-    return stance_share(level_feet(clip), velocity, clip.root_angular_velocity[:, 2], clip.dt)
+    return clip_stance(clip).float().mean()
 
 
 def level_feet(clip: MotionClip) -> Tensor:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -82,10 +83,25 @@ def footfall_diagram(contact: Tensor, dt: float, *, title: str = "") -> Figure:
         >>> len(footfall_diagram(torch.tensor([[1, 0, 0, 1], [0, 1, 1, 0]]).bool(), dt=0.02).axes[0].patches)
         4
     """
-    if contact.ndim != 2 or contact.shape[1] != len(LEGS):
-        raise ValueError(f"expected contacts [T, {len(LEGS)}], got {list(contact.shape)}")
     figure = new_figure(8.0, 2.2)
     axes = figure.add_subplot()
+    draw_footfalls(axes, contact, dt)
+    axes.set_xlabel("time [s]")
+    axes.set_title(title, fontsize=10)
+    return figure
+
+
+def draw_footfalls(axes: Axes, contact: Tensor, dt: float) -> None:
+    """The bars of :func:`footfall_diagram` on axes of a figure that holds more.
+
+    Example:
+        >>> axes = new_figure(4.0, 2.0).add_subplot()
+        >>> draw_footfalls(axes, torch.ones(50, 4).bool(), dt=0.02)
+        >>> len(axes.patches), float(axes.get_xlim()[1])
+        (4, 1.0)
+    """
+    if contact.ndim != 2 or contact.shape[1] != len(LEGS):
+        raise ValueError(f"expected contacts [T, {len(LEGS)}], got {list(contact.shape)}")
     edge = torch.zeros(1, dtype=torch.int8)
     for foot, leg in enumerate(LEGS):
         change = torch.diff(torch.cat((edge, contact[:, foot].bool().to(torch.int8).cpu(), edge)))
@@ -96,9 +112,6 @@ def footfall_diagram(contact: Tensor, dt: float, *, title: str = "") -> Figure:
     axes.set_yticks(range(len(LEGS)), LEGS)
     axes.invert_yaxis()
     axes.set_xlim(0.0, contact.shape[0] * dt)
-    axes.set_xlabel("time [s]")
-    axes.set_title(title, fontsize=10)
-    return figure
 
 
 def behaviour_matrix(counts: Tensor, names: Sequence[str], columns: Sequence[str] | None = None) -> Figure:

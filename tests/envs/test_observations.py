@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from agility_rl import keys
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.commands import CommandSampler
-from agility_rl.envs.observations import ObservationGroups
+from agility_rl.envs.observations import ObservationGroups, RecentFrames
 from agility_rl.envs.reference import ReferenceStates
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import features
@@ -78,12 +78,30 @@ def test_a_contact_is_seen_one_step_longer(neutral: Neutral, groups: Observation
 def test_reset_fills_only_its_rows(neutral: Neutral, groups: ObservationGroups) -> None:
     for k in range(12):
         groups.update(neutral(roll=torch.full((2,), 0.01 * k)))
-    before = groups.history, groups.motion
+    history, motion = groups.history, groups.motion()
     groups.reset(torch.tensor([False, True]), neutral(roll=torch.tensor([1.0, 2.0])))
-    assert torch.equal(groups.history[0], before[0][0]) and torch.equal(groups.motion[0], before[1][0])
-    assert (groups.history[1, :, 0] == 2.0).all() and (groups.motion[1, :, 0] == 2.0).all()
+    assert torch.equal(groups.history[0], history[0]) and torch.equal(groups.motion()[0], motion[0])
+    assert (groups.history[1, :, 0] == 2.0).all() and (groups.motion()[1, :, 0] == 2.0).all()
     torch.testing.assert_close(groups.history[0, :, 0], 0.01 * torch.arange(2.0, 12.0))  # oldest first
-    torch.testing.assert_close(groups.motion[0, :, 0], torch.tensor([0.10, 0.11]))
+    torch.testing.assert_close(motion[0, :, 0], torch.tensor([0.10, 0.11]))
+
+
+def test_a_ring_of_frames_is_a_list_of_which_the_oldest_is_dropped() -> None:
+    frames, generator = RecentFrames(2, 4, 3, "cpu"), torch.Generator().manual_seed(0)
+    expected = torch.zeros(2, 4, 3)
+    for step in range(11):
+        if step in (3, 8):  # one robot begins anew, wherever the ring has come to
+            frames.fill(torch.tensor([False, True]), fresh := torch.randn(1, 4, 3, generator=generator))
+            expected = torch.cat((expected[:1], fresh))
+        if step == 6:
+            whole = frames.all()
+            frames = RecentFrames(2, 4, 3, "cpu")
+            frames.restore(whole)
+        newest = torch.randn(2, 3, generator=generator)
+        frames.push(newest)
+        expected = torch.cat((expected[:, 1:], newest[:, None]), 1)
+        assert torch.equal(frames.all(), expected)
+        assert torch.equal(frames.read(torch.tensor([3, 0])), expected[:, [3, 0]])
 
 
 def test_noise_has_the_half_widths_of_the_layout(neutral: Neutral, generator: torch.Generator) -> None:
@@ -98,7 +116,7 @@ def test_noise_has_the_half_widths_of_the_layout(neutral: Neutral, generator: to
     assert (error.abs().amax(0) <= half + 1e-6).all()
     assert (error.abs().amax(0) >= 0.98 * half).all()
     assert (error.mean(0).abs() <= 5 * half / (3 * n) ** 0.5 + 1e-7).all()
-    assert torch.equal(groups.motion, clean.motion)  # what the discriminator sees is exact
+    assert torch.equal(groups.motion(), clean.motion())  # what the discriminator sees is exact
 
 
 def test_history_and_motion_slide_over_time(build: Build) -> None:

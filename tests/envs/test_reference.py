@@ -39,7 +39,7 @@ def test_each_skill_draws_only_its_own_states(generator: torch.Generator) -> Non
     skills = [3, 0, 1, 4, 2, 0, 3, 3]
     reference = ReferenceStates(states(skills))
     for skill in range(5):
-        drawn = reference.sample(torch.full((600,), skill), generator)
+        drawn = reference.states[reference.draw(torch.full((600,), skill), generator)]
         numbers = torch.bincount(drawn["root_height"][:, 0].long(), minlength=8)
         own = [i for i, s in enumerate(skills) if s == skill]
         assert numbers.nonzero()[:, 0].tolist() == own
@@ -48,16 +48,20 @@ def test_each_skill_draws_only_its_own_states(generator: torch.Generator) -> Non
 
 def test_entries_of_a_state_stay_together(generator: torch.Generator) -> None:
     given = states([3, 0, 1, 4, 2, 0])
-    drawn = ReferenceStates(given).sample(torch.tensor([0, 1, 2, 3, 4, 0]), generator)
-    for row in drawn:
+    given["past_motion"] = given["root_height"][:, None].repeat(1, 3, 49)
+    reference = ReferenceStates(given)
+    number = reference.draw(torch.tensor([0, 1, 2, 3, 4, 0]), generator)
+    assert reference.past_motion is not None
+    for row, past in zip(reference.states[number], reference.past_motion[number], strict=True):
         original = given[int(row["root_height"])]
         assert all(torch.equal(row[name], original[name]) for name in STATE_ENTRIES)
+        assert (past == row["root_height"]).all()
 
 
 def test_draws_follow_the_generator() -> None:
     reference = ReferenceStates(states([0, 1, 2, 3, 4] * 20))
     skill = torch.zeros(50, dtype=torch.int64)
-    one, other = (reference.sample(skill, torch.Generator().manual_seed(7))["root_height"] for _ in range(2))
+    one, other = (reference.draw(skill, torch.Generator().manual_seed(7)) for _ in range(2))
     assert torch.equal(one, other)
 
 

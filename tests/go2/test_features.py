@@ -66,7 +66,7 @@ def test_a_measurement_is_in_plain_units_and_without_trunk_velocity() -> None:
 
 def test_feet_are_turned_upright_but_not_by_yaw() -> None:
     roll, pitch = torch.tensor(0.3), torch.tensor(-0.4)
-    feet = features.feet_in_heading_frame(roll, pitch, POSE)
+    feet = features.in_heading_frame(roll, pitch, kinematics.forward(POSE))
     full = rotations.from_euler(roll, pitch, torch.tensor(1.2))
     world = rotations.rotate(full, kinematics.forward(POSE))
     c, s = math.cos(1.2), math.sin(1.2)

@@ -10,7 +10,7 @@ from agility_rl.motion import MotionError, synthesize_gait
 from agility_rl.motion.edit import mirror
 from agility_rl.motion.gait_analysis import level_feet, measure_clip
 from agility_rl.motion.gaits import synthetic_dataset_clips
-from agility_rl.motion.stride_patterns import FREQUENCY_GROWTH, mirrored, stride_patterns
+from agility_rl.motion.stride_patterns import DUTY_GROWTH, FREQUENCY_GROWTH, mirrored, stride_patterns
 
 
 def test_patterns_are_what_the_gait_measurement_finds() -> None:
@@ -39,9 +39,10 @@ def test_the_share_of_a_sine_is_what_the_power_spectrum_has_at_the_stride_freque
         assert patterns["share"][index].item() == pytest.approx((power[strides] / power.sum()).item(), abs=0.06)
 
 
-def test_only_the_walk_hurries_with_its_speed() -> None:
-    growth = stride_patterns([synthesize_gait(name) for name in BEHAVIOURS])["growth"]
-    assert growth.tolist() == [FREQUENCY_GROWTH["walk"], 0.0, 0.0, 0.0, 0.0]
+def test_the_walk_hurries_and_the_canter_stands_less_with_its_speed() -> None:
+    patterns = stride_patterns([synthesize_gait(name) for name in BEHAVIOURS])
+    assert patterns["frequency_growth"].tolist() == [FREQUENCY_GROWTH["walk"], 0.0, 0.0, 0.0, 0.0]
+    torch.testing.assert_close(patterns["duty_growth"], torch.tensor([0.0, 0.0, 0.0, DUTY_GROWTH["canter"], 0.0]))
 
 
 def test_a_mirrored_clip_has_the_mirrored_pattern() -> None:
