@@ -115,30 +115,28 @@ def expert_batch(
 @torch.no_grad()
 def add_rewards(parts: Components, cfg: ImitationConfig, batch: TensorDictBase, dt: float) -> dict[str, Tensor]:
     """Equation (11): imitation, skill and shift reward of every step beside the task reward; returns their means."""
-    seen = TensorDict(
-        {keys.MOTION: batch["next", keys.MOTION], keys.SKILL: batch[keys.SKILL]}, batch.batch_size
-    ).flatten()
-    parts.predictor(parts.discriminator(seen))
     shape = (*batch.batch_size, 1)
     skill, shift = batch[keys.SKILL].flatten(), batch[keys.SHIFT].flatten(0, 1)
-    told = functional.skill_reward(seen[keys.SKILL_LOGITS], skill)
+    features = parts.discriminator.trunk(batch["next", keys.MOTION].flatten(0, 1))  # once: the two share it
+    logit, (skill_logits, shown_shift) = parts.discriminator.judge(features, skill), parts.predictor.predict(features)
+    told = functional.skill_reward(skill_logits, skill)
     if cfg.skill_floor is not None:
         told = 1.0 - told.clamp(min=cfg.skill_floor) / cfg.skill_floor
     paid = dt * (1.0 - cfg.gate * (1.0 - speed_share(parts, batch).flatten(0, 1).clamp(0.0, 1.0)))
+    style = functional.imitation_reward(logit)
     rewards = {
-        "imitation": cfg.imitation_reward * paid * functional.imitation_reward(seen[keys.DISCRIMINATOR_LOGIT]),
+        "imitation": cfg.imitation_reward * paid * style,
         "skill": cfg.skill_reward * paid * told,
-        "shift": cfg.shift_reward * dt * functional.shift_reward(seen[keys.SHIFT_ESTIMATE], shift),
+        "shift": cfg.shift_reward * dt * functional.shift_reward(shown_shift, shift),
         "task": cfg.task_reward * batch["next", "reward"].flatten(0, 1),
     }
     batch["next", "reward"] = torch.stack(tuple(rewards.values())).sum(0).reshape(shape)
     metrics = {f"reward/{name}": value.mean() for name, value in rewards.items()}
-    recovered = (seen[keys.SKILL_LOGITS].argmax(-1) == skill).float()
-    style = functional.imitation_reward(seen[keys.DISCRIMINATOR_LOGIT])[:, 0]
+    recovered = (skill_logits.argmax(-1) == skill).float()
     for index, name in enumerate(BEHAVIOURS):
         chosen = skill == index
         metrics[f"recovery/{name}"] = recovered[chosen].mean()
-        metrics[f"style/{name}"] = style[chosen].mean()
+        metrics[f"style/{name}"] = style[chosen, 0].mean()
     return metrics
 
 

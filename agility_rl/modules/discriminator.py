@@ -153,14 +153,17 @@ class Discriminator(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the logit and the normalised motion."""
         normalized = self.trunk.normalize(tensordict.get(self.motion_key))
-        features = self.trunk.encode(normalized)
-        logit = self.head(features)  # [*B, 1]
-        if self.embedding is not None:
-            embedded = self.embedding(tensordict.get(self.skill_key))  # [*B, hidden]
-            logit = logit + (embedded * features).sum(-1, keepdim=True)
-        tensordict.set(self.out_key, logit)
+        skill = None if self.embedding is None else tensordict.get(self.skill_key)
+        tensordict.set(self.out_key, self.judge(self.trunk.encode(normalized), skill))
         tensordict.set(self.normalized_key, normalized)
         return tensordict
+
+    def judge(self, features: Tensor, skill: Tensor | None = None) -> Tensor:
+        """Logit ``[*B, 1]`` of what the trunk made of motion, ``[*B, hidden]``; ``skill`` ``[*B]`` where it counts."""
+        logit = self.head(features)
+        if self.embedding is None:
+            return logit
+        return logit + (self.embedding(skill) * features).sum(-1, keepdim=True)
 
 
 def resolve_trunk(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 
 from agility_rl.behaviours import NUM_BEHAVIOURS
 from agility_rl.keys import MOTION, SHIFT_ESTIMATE, SKILL_LOGITS
@@ -79,7 +79,11 @@ class Predictor(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write skill logits and shift estimate."""
-        features = self.trunk(tensordict.get(self.motion_key))
-        tensordict.set(self.skill_logits_key, self.skill_head(features))
-        tensordict.set(self.shift_estimate_key, self.shift_head(features))
+        skill_logits, shift_estimate = self.predict(self.trunk(tensordict.get(self.motion_key)))
+        tensordict.set(self.skill_logits_key, skill_logits)
+        tensordict.set(self.shift_estimate_key, shift_estimate)
         return tensordict
+
+    def predict(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Skill logits ``[*B, K]`` and shift ``[*B, S]`` from what the trunk made of motion, ``[*B, hidden]``."""
+        return self.skill_head(features), self.shift_head(features)
