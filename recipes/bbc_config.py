@@ -28,6 +28,9 @@ class MotionConfig:
     """Frames that the discriminator sees together, in control steps from the oldest (Table S1: two consecutive)."""
     standing_weight: float = 0.1
     """Sampling weight of unlabelled frames in which the dog stands (1 = as recorded)."""
+    label_share: float | None = None
+    """Keep so much labelled motion, as a share of all motion (0.01: one per cent), alike of every behaviour and the
+    longest clips first; what is cut off is not used at all. All labels when not given."""
 
 
 @dataclass(frozen=True)

@@ -25,11 +25,14 @@ from agility_rl.envs.rewards import (
     velocity_progress,
 )
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, thigh_contact
-from agility_rl.motion import MotionDataset, load_clips
+from agility_rl.motion import MotionClip, MotionDataset, load_clips
 from agility_rl.motion.gaits import synthetic_dataset_clips
 from agility_rl.motion.stride_patterns import stride_patterns
 from agility_rl.simulation import HeightField, ridges, rough_pyramids
 from agility_rl.training.seeding import Seeds
+
+SHORTEST = 0.5
+"""Seconds of labelled motion below which no gait can be told."""
 
 
 def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv:
@@ -104,6 +107,8 @@ def load_dataset(cfg: MotionConfig, seed: int) -> MotionDataset:
         labelled, unlabelled = synthetic_dataset_clips(seed)
     else:
         labelled, unlabelled = load_clips(cfg.labelled, label="from name"), load_clips(cfg.unlabelled)
+    if cfg.label_share is not None:
+        labelled = fewer_labels(labelled, cfg.label_share, sum(clip.duration for clip in (*labelled, *unlabelled)))
     return MotionDataset(
         labelled,
         unlabelled,
@@ -113,3 +118,18 @@ def load_dataset(cfg: MotionConfig, seed: int) -> MotionDataset:
         one_sided=cfg.one_sided,
         turns=cfg.turns,
     )
+
+
+def fewer_labels(labelled: list[MotionClip], share: float, total: float) -> list[MotionClip]:
+    """The same time of every behaviour, as far as there is so much of it: ``share`` of ``total`` seconds in all."""
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f"--motion.label-share: expected more than 0 and at most 1, got {share}")
+    kept: list[MotionClip] = []
+    for name in BEHAVIOURS:
+        left = share * total / len(BEHAVIOURS)
+        for clip in sorted((clip for clip in labelled if clip.label == name), key=lambda clip: -clip.duration):
+            frames = min(round(left / clip.dt) + 1, clip.num_frames)
+            if frames * clip.dt > SHORTEST:
+                kept.append(clip.slice(0, frames))
+                left -= kept[-1].duration
+    return kept

@@ -9,7 +9,9 @@ from types import ModuleType
 import pytest
 import torch
 
+from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.go2.constants import DEFAULT_POSE
+from agility_rl.motion import synthesize_gait
 
 Module = Callable[[str], ModuleType]
 
@@ -44,3 +46,21 @@ def test_rough_ground_is_as_rough_and_steep_as_told(module: Module) -> None:
     steep = replace(published, terrain="rough", roughness=0.0, steepness=1.0)
     slopes = world.make_terrain(steep, torch.Generator().manual_seed(0)).heights.diff(dim=0).abs()
     assert slopes.max().item() == pytest.approx(0.4 * 0.1, abs=1e-6)  # the steepest tiles, cells of 0.1 m
+
+
+def test_fewer_labels_are_alike_of_every_behaviour_and_of_the_longest_clips(module: Module) -> None:
+    world = module("bbc_world")
+    clips = [synthesize_gait(name, duration=length) for name in BEHAVIOURS for length in (0.8, 4.0, 2.0)]
+    total = 100.0
+    for share, each in ((0.05, 1.0), (0.25, 5.0), (1.0, 6.8)):
+        kept = world.fewer_labels(clips, share, total)
+        for name in BEHAVIOURS:
+            own = [clip for clip in kept if clip.label == name]
+            assert sum(clip.duration for clip in own) == pytest.approx(each, abs=0.07)
+            assert [clip.duration for clip in own] == sorted((clip.duration for clip in own), reverse=True)
+    assert not world.fewer_labels(clips, 0.02, total), "0.4 s of a behaviour show no gait"
+    smoke = module("bbc_presets").SMOKE
+    whole, part = (world.load_dataset(replace(smoke.motion, label_share=share), 0) for share in (None, 0.02))
+    assert 0 < sum(c.duration for c in part.labelled_clips) < 0.6 * sum(c.duration for c in whole.labelled_clips)
+    with pytest.raises(ValueError, match=r"--motion.label-share: expected more than 0 and at most 1, got 0"):
+        world.fewer_labels(clips, 0.0, total)
