@@ -151,8 +151,9 @@ class ImitationConfig:
     """First iteration and length of the ramp of the information-maximisation term (released code)."""
     prior_weight: float = 1e-3
     """Table S1: moving average weight, 1 - beta."""
-    prior_temperature: float | None = 0.25
-    """Skills are drawn from softmax(prior / temperature) (released code); ``None``: from the prior itself."""
+    prior_temperature: float | None = None
+    """Skills are drawn from the prior itself (Algorithm S1, line 3), or from softmax(prior / temperature), which the
+    released code does with 0.25."""
     imitation_reward: float = 0.2
     """Table S1 (released code: 1.0)."""
     skill_reward: float = 0.2

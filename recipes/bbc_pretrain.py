@@ -31,15 +31,17 @@ from training_run import Laps, own_options, run
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS, COMMANDS
 from agility_rl.deploy.artifact import Artifact
+from agility_rl.go2 import features
 from agility_rl.losses import functional
 from agility_rl.training import cli, distributed
 from agility_rl.training.distributed import optimized
 
+VELOCITY = features.layout_slice(features.EXPLICIT_LAYOUT, "linear_velocity")
+TURN_RATE = features.layout_slice(features.PROPRIOCEPTION_LAYOUT, "angular_velocity")
 HEADLINE: tuple[str, ...] = (
-    *("time/minutes", "reward/imitation", "reward/task", "accuracy_expert", "accuracy_policy", "kl"),
-    "falls_per_minute",
-    *(f"style/{name}" for name in BEHAVIOURS),
-    *(f"recovery/{name}" for name in BEHAVIOURS),
+    *("time/minutes", "share/imitation", "share/skill", "share/shift", "share/task", "accuracy_expert"),
+    *("accuracy_policy", "kl", "falls_per_minute", "error/speed", "error/turn_rate"),
+    *(f"{group}/{name}" for group in ("style", "recovery", "prior") for name in BEHAVIOURS),
 )
 
 
@@ -132,12 +134,25 @@ def add_rewards(parts: Components, cfg: ImitationConfig, batch: TensorDictBase, 
     }
     batch["next", "reward"] = torch.stack(tuple(rewards.values())).sum(0).reshape(shape)
     metrics = {f"reward/{name}": value.mean() for name, value in rewards.items()}
+    whole = torch.stack([value.abs().mean() for value in rewards.values()]).sum().clamp(min=1e-12)
+    metrics |= {f"share/{name}": value.abs().mean() / whole for name, value in rewards.items()}
     recovered = (skill_logits.argmax(-1) == skill).float()
     for index, name in enumerate(BEHAVIOURS):
         chosen = skill == index
         metrics[f"recovery/{name}"] = recovered[chosen].mean()
         metrics[f"style/{name}"] = style[chosen, 0].mean()
     return metrics
+
+
+def tracking_error(batch: TensorDictBase) -> dict[str, Tensor]:
+    """Mean distance of the velocity from the commanded one [m/s], and of the turn rate [rad/s], at every instant."""
+    velocity = batch[keys.EXPLICIT][..., VELOCITY] / features.LINEAR_VELOCITY_SCALE
+    turn_rate = batch[keys.PROPRIOCEPTION][..., TURN_RATE] / features.ANGULAR_VELOCITY_SCALE
+    wanted = batch[keys.COMMAND]
+    return {
+        "error/speed": (wanted[..., :2] - velocity[..., :2]).norm(dim=-1).mean(),
+        "error/turn_rate": (wanted[..., 2] - turn_rate[..., 2]).abs().mean(),
+    }
 
 
 def speed_share(parts: Components, batch: TensorDictBase) -> Tensor:
@@ -249,6 +264,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     lap("adaptation")
     metrics |= {f"task/{name}": value.mean() for name, value in batch["next", keys.REWARD_TERMS].items()}
     metrics |= {f"prior/{name}": p for name, p in zip(BEHAVIOURS, parts.prior.probabilities, strict=True)}
+    metrics |= tracking_error(batch)
     metrics["falls_per_minute"] = batch["next", "terminated"].float().mean() * 60.0 / parts.env.dt
     return {name: float(value) for name, value in metrics.items()} | lap.metrics
 

@@ -224,6 +224,7 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     data = ["/".join(clip.resolve().parts[-2:]) for clip in clips if clip] or ["synthetic gaits of agility_rl"]
     manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=parts.env.dt, data=data)
     manifest |= {"network": parts.bbc.settings, "prior": parts.prior.probabilities.tolist()}
+    manifest["simulation"] = {"friction_loss": cfg.env.friction_loss}
     Artifact.save(folder / "policy", parts.bbc.state_dict(), manifest)
     layouts = {"motion": features.MOTION_LAYOUT}
     manifest = build_manifest("discriminator", layouts, control_period=parts.env.dt, data=data)

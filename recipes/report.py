@@ -34,6 +34,8 @@ COURSE = "course"
 """Folder of a run in which another controller was evaluated on courses: ``evaluate_course.py --output RUN/course``."""
 GROUPS = {
     "Rewards": "reward/",
+    "Shares of the rewards": "share/",
+    "Distance from the commands": "error/",
     "Style of each behaviour": "style/",
     "Behaviours recovered by the predictor": "recovery/",
     "Task terms": "task/",
@@ -180,9 +182,9 @@ def page(run: Path) -> str:
     if record and not found and not courses[run]:
         recipe = "evaluate" if record.get("recipe", "bbc_pretrain").startswith("bbc") else "evaluate_course"
         parts.append(note(f"not evaluated yet: run recipes/{recipe}.py on it"))
-    strips = sorted((run / "figures").glob("play_*.png"))
+    strips = sorted((run / "figures").glob("perform_*.png"))
     if strips:
-        parts += ["<h2>Pictures</h2>", *(picture(strip, strip.stem.removeprefix("play_")) for strip in strips)]
+        parts += ["<h2>Pictures</h2>", *(picture(strip, strip.stem.replace("_", " ")) for strip in strips)]
     parts += ["<h2>Learning</h2>", curves(run)]
     parts.append("<h2>What it was made of</h2>")
     if data := manifest.get("data"):

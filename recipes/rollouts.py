@@ -99,7 +99,8 @@ def load_controller(path: Path) -> Controller:
     artifact.fill(bbc)
     file = run / "config.json"
     trained = json.loads(file.read_text(encoding="utf-8"))["config"] if file.is_file() else {}
-    return Controller(bbc, artifact, trained, run, trained.get("env", {}).get("friction_loss", 0.0))
+    told = artifact.manifest.get("simulation", {}).get("friction_loss", 0.0)
+    return Controller(bbc, artifact, trained, run, trained.get("env", {}).get("friction_loss", told))
 
 
 def load_motion(config: MotionConfig, trained: Mapping[str, Any], seed: int) -> Motion:

@@ -108,6 +108,10 @@ class SavedRun:
         if self._own is None:
             self._main.save(step)
 
+    def exists(self) -> bool:
+        """Whether the first process has saved anything yet."""
+        return bool(self._main.steps())
+
     def load(self) -> None:
         """Restore the newest checkpoint."""
         step = self._main.load(components=None if self._own is None else self._alike)
@@ -159,20 +163,24 @@ def _run(
     distributed.wait()
     progress: dict[str, float] = {"iteration": 0, "minutes": 0.0}
     saved = SavedRun(folder / "checkpoints", parts, progress)
-    if resumed:
+    if resumed and saved.exists():
         saved.load()
-    else:
+    else:  # a new run, or one that was killed before its first checkpoint: it begins anew, with the same numbers
         try:
             begin(parts, cfg)
         except BaseException:  # nothing is learned yet, and the name stays free
-            if first:
+            if first and not resumed:
                 cli.abandon_run(folder)
             raise
         distributed.share(part for part in parts.alike.values() if isinstance(part, nn.Module))
     logger = MCAPLogger(folder.name, folder.parent, resume=resumed) if first else None
+    if logger is not None and not resumed:
+        logger.log_hparams(cli.to_json(cfg))
     start = time.monotonic() - 60.0 * progress["minutes"]
 
     def save() -> None:
+        if logger is not None:
+            logger.flush()  # first: what a checkpoint goes on from is in the log, whenever the run is killed
         saved.save()
         if first:
             save_policy(parts, cfg, folder)

@@ -58,6 +58,8 @@ EXPLICIT_LAYOUT: tuple[Entry, ...] = (
     Entry("root_height", 1, "m over the terrain"),
     Entry("linear_velocity", 3, "m/s, base frame", LINEAR_VELOCITY_SCALE, 0.1),
 )
+"""What the robot cannot measure; the half-width is the released one. Nobody reads it with noise: the actor has an
+estimate, and the critic the truth."""
 
 MOTION_LAYOUT: tuple[Entry, ...] = (
     Entry("roll_pitch", 2, "rad"),

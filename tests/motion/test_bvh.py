@@ -79,6 +79,20 @@ def test_agrees_with_the_published_keypoints(data: Path, recording: str, table: 
     assert (position - golden.position).abs().max() < 1e-4
 
 
+def test_agrees_with_a_published_cut_out_turned_about_the_vertical(data: Path) -> None:
+    """``dog_pace`` is a piece of a recording, somewhere else and heading elsewhere: the same heights, and the same
+    horizontal places in all frames once one translation and one turn are undone. A mirror image would not pass."""
+    points = read_bvh(data / "mann_bvh" / "D1_007_KAN01_001.bvh").keypoints().slice(226, 265)
+    golden = read_keypoints(data / "mann_keypoints" / "dog_pace_joint_pos.txt")
+    assert points.position.shape == golden.position.shape == (39, 27, 3)
+    assert (points.position[..., 2] - golden.position[..., 2]).abs().max() < 1e-4
+    found, expected = (torch.view_as_complex(p.position[..., :2].contiguous()) for p in (points, golden))
+    found, expected = found - found.mean(), expected - expected.mean()
+    turn = (expected * found.conj()).sum().angle()  # of the least squares
+    assert turn.abs() > 0.1, "nothing to undo: compare it with the tables above"
+    assert (found * torch.polar(torch.ones_like(turn), turn) - expected).abs().max() < 1e-4
+
+
 def test_a_recording_becomes_a_clip(data: Path) -> None:
     clip = read_bvh_clip(data / "mann_bvh" / "D1_010_KAN01_003.bvh")
     assert clip.num_frames == 203

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from agility_rl.deploy.artifact import Artifact
-from agility_rl.record.mcap_logger import read_scalars
+from agility_rl.record.mcap_logger import read_hparams, read_scalars
 from agility_rl.training.checkpoint import RunCheckpoint
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "bbc_pretrain.py"
@@ -26,6 +26,13 @@ ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1"}
 
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
+EVERYTHING = (
+    *("--env.rhythm-weight", "1.0", "--env.randomize", "--env.push-interval", "0.1", "--env.observation-noise", "1"),
+    *("--env.action-delay", "0.01", "--env.action-delay-from", "5", "--env.progress-fade", "2", "4"),
+    *("--imitation.information-ramp", "2", "4", "--adaptation.privileged-ramp", "3", "2", "--adaptation.every", "3"),
+    *("--changes", "5", "ppo.entropy", "0.002", "6", "env.jump-weight", "9.0"),
+)
+"""Whatever is random, and ramps and changes on both sides of the middle of eight iterations."""
 
 
 def run(folder: Path, *options: str, check: bool = True) -> subprocess.CompletedProcess[str]:
@@ -35,9 +42,9 @@ def run(folder: Path, *options: str, check: bool = True) -> subprocess.Completed
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four iterations without interruption."""
+    """Eight iterations without interruption."""
     folder = tmp_path_factory.mktemp("runs")
-    run(folder, "--name", "whole", "--iterations", "4", "--env.rhythm-weight", "1.0")
+    run(folder, "--name", "whole", "--iterations", "8", *EVERYTHING)
     return folder
 
 
@@ -50,19 +57,23 @@ def test_smoke_run_writes_everything_the_next_stage_needs(finished: Path) -> Non
     record = json.loads((whole / "config.json").read_text())
     assert record["config"]["seed"] == 0 and "torchrl" in record["versions"]
     scalars = read_scalars(whole)
-    for name in ("reward/imitation", "reward/task", "accuracy_expert", "recovery/trot", "prior/walk"):
-        assert scalars[name][0].tolist() == [1, 2, 3, 4]
+    for name in ("reward/imitation", "share/task", "error/speed", "accuracy_expert", "recovery/trot", "prior/walk"):
+        assert scalars[name][0].tolist() == list(range(1, 9))
     assert bool(scalars["loss_critic"][1].isfinite().all())
+    shares = sum(scalars[f"share/{name}"][1] for name in ("imitation", "skill", "shift", "task"))
+    torch.testing.assert_close(shares, torch.ones_like(shares))
+    settings = read_hparams(whole)
+    assert settings["iterations"] == 8 and settings["ppo"]["clip"] == 0.2
 
 
 def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished: Path) -> None:
-    run(finished, "--name", "halves", "--iterations", "2", "--env.rhythm-weight", "1.0")
-    run(finished, "--resume", str(finished / "halves"), "--iterations", "4")
+    run(finished, "--name", "halves", "--iterations", "4", *EVERYTHING)
+    run(finished, "--resume", str(finished / "halves"), "--iterations", "8")
     whole, halves = (Artifact.load(finished / name / "policy").state for name in ("whole", "halves"))
     assert whole.keys() == halves.keys()
     different = [name for name, tensor in whole.items() if not torch.equal(tensor, halves[name])]
     assert not different
-    for name in ("reward/imitation", "loss_critic", "loss_discriminator", "prior/jump", "task/rhythm"):
+    for name in ("reward/imitation", "loss_critic", "loss_discriminator", "prior/jump", "task/rhythm", "error/speed"):
         expected, got = (read_scalars(finished / run_name)[name][1] for run_name in ("whole", "halves"))
         assert torch.equal(expected, got), name
 
@@ -99,6 +110,34 @@ def test_ctrl_c_saves_what_a_resume_goes_on_from(tmp_path: Path) -> None:
     done = len(read_scalars(tmp_path / "cut")["reward/task"][0])
     run(tmp_path, "--resume", str(tmp_path / "cut"), "--iterations", str(done + 1))
     assert read_scalars(tmp_path / "cut")["reward/task"][0].tolist() == list(range(1, done + 2))
+
+
+@pytest.mark.parametrize("moment", ["before its first checkpoint", "later"])
+def test_a_killed_run_goes_on(tmp_path: Path, moment: str) -> None:
+    folder = tmp_path / "cut"
+    every, wanted = ("100000", folder / "metrics.mcap") if moment != "later" else ("1", folder / "policy")
+    command = [sys.executable, str(RECIPE), "smoke", "--runs", str(tmp_path), "--name", "cut"]
+    with subprocess.Popen(
+        [*command, "--iterations", "100000", "--checkpoint-every", every],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=ONE_THREAD,
+    ) as process:
+        deadline = time.monotonic() + 240.0
+        try:
+            while not wanted.exists():
+                assert process.poll() is None and time.monotonic() < deadline
+                time.sleep(0.02)
+        finally:
+            process.kill()
+    assert process.returncode == -signal.SIGKILL
+    steps = RunCheckpoint(folder / "checkpoints", counters={}).steps()
+    assert bool(steps) == (moment == "later")
+    done = steps[-1] if steps else 0
+    run(tmp_path, "--resume", str(folder), "--iterations", str(done + 2))
+    assert read_scalars(folder)["reward/task"][0].tolist() == list(range(1, done + 3))
+    assert (folder / "policy" / "manifest.json").is_file()
 
 
 @pytest.mark.parametrize(
@@ -220,3 +259,31 @@ def test_two_processes_train_one_policy_and_resume_bit_for_bit(tmp_path: Path) -
     run(tmp_path, "--resume", str(tmp_path / "halves"), "--iterations", "5")
     run_two(tmp_path, "--resume", str(tmp_path / "halves"), "--iterations", "6")
     assert read_scalars(tmp_path / "halves")["reward/task"][0].tolist() == [1, 2, 3, 4, 5, 6]
+
+
+def test_the_paper_preset_is_table_s1_and_the_supplement(module: Callable[[str], ModuleType]) -> None:
+    paper = module("bbc_presets").PRESETS["paper"]
+    ppo, imitation = paper.ppo, paper.imitation
+    assert (ppo.learning_rate, ppo.gamma, ppo.lmbda, ppo.clip) == (1e-3, 0.99, 0.95, 0.2)
+    assert (imitation.discriminator_learning_rate, imitation.encoder_learning_rate) == (5e-4, 1e-3)
+    assert len(paper.motion.offsets) == 2 and paper.motion.offsets[1] - paper.motion.offsets[0] == 1
+    assert (imitation.prior_weight, imitation.imitation_reward, imitation.task_reward) == (1e-3, 0.2, 0.2)
+    assert ppo.hidden == (512, 256, 128)  # section S6
+    assert imitation.prior_temperature is None, "Algorithm S1, line 3: skills are drawn from the prior"
+    assert imitation.criterion == "least_squares" and not imitation.conditional  # Eq. (10)
+    assert paper.env.terrain == "rough" and paper.env.randomize and paper.env.push_interval  # section S2
+    ours = (paper.env.rhythm_weight, paper.env.progress_weight, paper.env.turn_weight, paper.motion.turns)
+    assert ours == (0.0, 0.0, 0.0, ()) and imitation.cloning == imitation.warm_up == imitation.gate == 0
+
+
+def test_speed_and_turn_rate_errors_by_hand(module: Callable[[str], ModuleType]) -> None:
+    command = torch.zeros(1, 2, 11)
+    command[..., :3] = torch.tensor([[1.0, 0.0, 0.5], [0.5, 0.0, 0.0]])
+    explicit, proprioception = torch.zeros(1, 2, 4), torch.zeros(1, 2, 45)
+    explicit[0, :, 1:3] = 0.5 * torch.tensor([[1.0, 0.0], [0.2, 0.4]])  # scale of linear velocities
+    proprioception[0, :, 4] = 0.25 * torch.tensor([0.1, -0.2])  # scale of angular velocities; x, y, z from 2 on
+    names = ("command", "explicit", "proprioception")
+    batch = dict(zip(names, (command, explicit, proprioception), strict=True))
+    found = module("bbc_pretrain").tracking_error(batch)
+    assert found["error/speed"].item() == pytest.approx(0.25)  # 0 and a distance of (0.3, -0.4)
+    assert found["error/turn_rate"].item() == pytest.approx(0.3)  # 0.4 and 0.2

@@ -13,6 +13,8 @@ import torch
 from agility_rl import rotations
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact, build_manifest
+from agility_rl.go2 import features
+from agility_rl.modules import BasicBehaviourController
 from agility_rl.motion.gaits import synthesize_gait
 from agility_rl.training.metrics import Interval
 
@@ -143,3 +145,15 @@ def test_the_prior_is_compared_with_shares_of_time(evaluate: ModuleType) -> None
     found = evaluate.evaluate_prior([0.0, 0.5, 0.5, 0.0, 0.0], clips)
     assert float(found["total_variation"]) == pytest.approx(0.0, abs=1e-9)
     assert found["unlabelled_seconds"]["trot"] == pytest.approx(6.0, abs=0.1)
+
+
+def test_a_controller_is_driven_with_the_friction_that_it_was_trained_with(tmp_path: Path, module) -> None:
+    """By its run's options; without them, by its manifest."""
+    load, bbc = module("rollouts").load_controller, BasicBehaviourController(hidden=(16, 16))
+    manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=0.02)
+    for name, told in (("plain", {}), ("told", {"simulation": {"friction_loss": 0.2}})):
+        Artifact.save(tmp_path / name, bbc.state_dict(), manifest | {"network": bbc.settings} | told)
+    assert [load(tmp_path / name).friction_loss for name in ("plain", "told")] == [0.0, 0.2]
+    Artifact.save(tmp_path / "run" / "policy", bbc.state_dict(), manifest | {"network": bbc.settings} | told)
+    (tmp_path / "run" / "config.json").write_text(json.dumps({"config": {"env": {"friction_loss": 0.1}}}))
+    assert load(tmp_path / "run").friction_loss == 0.1

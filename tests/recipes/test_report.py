@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from agility_rl.record import MCAPLogger
+from agility_rl.record.plots import new_figure, save_figure
 from agility_rl.training.cli import start_run
 
 
@@ -27,6 +28,14 @@ def test_a_run_without_evaluation_shows_its_learning_curves(tmp_path: Path, modu
     text = (run / "report.html").read_text()
     assert "not evaluated yet" in text and text.count("data:image/png;base64,") == 2
     assert "<b>bold</b>" not in text, "what a run contains is text, never markup"
+
+
+def test_pictures_of_performances_are_on_the_page(tmp_path: Path, module) -> None:
+    run = start_run(Config(), tmp_path / "shown", recipe="bbc_pretrain")
+    save_figure(new_figure(1.0, 1.0), run / "figures" / "perform_0.png")
+    module("report").main(module("report").Config(run))
+    text = (run / "report.html").read_text()
+    assert "<h2>Pictures</h2>" in text and "perform 0" in text and text.count("data:image/png;base64,") == 1
 
 
 def test_a_folder_that_is_no_run(tmp_path: Path, module) -> None:
