@@ -26,7 +26,8 @@ CPU = Config(
         (350, "ppo.entropy", 0.0005),
         (500, "ppo.desired_kl", 0.008),
         (500, "imitation.imitation_reward", 6.0),
-        (500, "env.jump_weight", 20.0),
+        (500, "env.jump_weight", 30.0),
+        (900, "ppo.desired_kl", 0.004),
     ),
     motion=MotionConfig(one_sided=("canter",), offsets=(0, 8, 16, 23, 24), standing_weight=0.0),
     env=EnvConfig(
