@@ -104,9 +104,20 @@ def _spectrum(clip: MotionClip) -> tuple[Tensor, Tensor]:
     """``[4]``, frequency [Hz], speed [m/s], share of a sine, duty factor; cross-spectra ``[6]`` of length one."""
     swing = detrend(level_feet(clip)[..., 0].float())
     frequency, cross = stride_spectrum(swing, clip.dt)
-    angle = 2 * torch.pi * frequency * clip.dt * torch.arange(len(swing))
-    sines = torch.stack((angle.cos(), angle.sin()), 1)
-    fitted = sines @ torch.linalg.lstsq(sines, swing).solution
-    share = fitted.square().sum() / swing.square().sum()
+    angle = 2 * torch.pi * frequency.double() * clip.dt * torch.arange(len(swing))
+    share = _sine_power(angle, swing.double()).sum() / swing.double().square().sum()
     speed = clip.root_linear_velocity[:, :2].norm(dim=-1).mean()
-    return torch.stack((frequency, speed, share, clip_stance_share(clip))), cross / cross.abs()
+    return torch.stack((frequency, speed, share.float(), clip_stance_share(clip))), cross / cross.abs()
+
+
+def _sine_power(angle: Tensor, signals: Tensor) -> Tensor:
+    """Sum of squares ``[4]`` of the sines of phases ``[T]`` that fit signals ``[T, 4]`` best.
+
+    The two normal equations are solved by hand: LAPACK's last bit depends on where its memory lies, and a run that
+    goes on would then reward otherwise than one that never stopped.
+    """
+    cosine, sine = angle.cos(), angle.sin()
+    both = (cosine * sine).sum()
+    along, across = ((wave[:, None] * signals).sum(0) for wave in (cosine, sine))
+    power = sine.square().sum() * along.square() + cosine.square().sum() * across.square() - 2 * both * along * across
+    return power / (cosine.square().sum() * sine.square().sum() - both.square())

@@ -8,7 +8,7 @@ import torch
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.motion import MotionError, synthesize_gait
 from agility_rl.motion.edit import mirror
-from agility_rl.motion.gait_analysis import level_feet, measure_clip
+from agility_rl.motion.gait_analysis import detrend, level_feet, measure_clip
 from agility_rl.motion.gaits import synthetic_dataset_clips
 from agility_rl.motion.stride_patterns import DUTY_GROWTH, FREQUENCY_GROWTH, mirrored, stride_patterns
 
@@ -37,6 +37,17 @@ def test_the_share_of_a_sine_is_what_the_power_spectrum_has_at_the_stride_freque
         swing = level_feet(clip)[:steps, :, 0].float()
         power = torch.fft.rfft(swing - swing.mean(0), dim=0).abs().square().sum(-1)
         assert patterns["share"][index].item() == pytest.approx((power[strides] / power.sum()).item(), abs=0.06)
+
+
+def test_the_share_of_a_sine_is_that_of_least_squares() -> None:
+    for clip in synthetic_dataset_clips(0)[0]:
+        patterns = stride_patterns([synthesize_gait(name) for name in BEHAVIOURS if name != clip.label] + [clip])
+        pattern = patterns[BEHAVIOURS.index(str(clip.label))]
+        swing = detrend(level_feet(clip)[..., 0].float())
+        angle = 2 * torch.pi * pattern["frequency"] * clip.dt * torch.arange(len(swing))
+        waves = torch.stack((angle.cos(), angle.sin()), 1)
+        fitted = waves @ torch.linalg.lstsq(waves, swing).solution
+        torch.testing.assert_close(pattern["share"], fitted.square().sum() / swing.square().sum())
 
 
 def test_faster_walks_hurry_and_faster_walks_and_canters_stand_less() -> None:
