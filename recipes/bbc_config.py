@@ -104,6 +104,9 @@ class PPOConfig:
     """Of the hidden layers in the update; ``auto`` is bfloat16 on hardware that multiplies in it."""
     compile: bool = False
     """Fuse PPO's loss by ``torch.compile``: a minute once, then a faster update (docs/gpu.md)."""
+    averaging: float = 0.0
+    """What is saved is a moving average of the controller's weights with this decay an iteration: behaviours that come
+    and go between two checkpoints are then there in both. 0: the last weights."""
     initial_std: float = 1.0
     min_std: float = 0.1
     hidden: tuple[int, ...] = (512, 256, 128)

@@ -26,8 +26,7 @@ CPU = Config(
         (350, "ppo.entropy", 0.0005),
         (500, "ppo.desired_kl", 0.008),
         (500, "imitation.imitation_reward", 6.0),
-        (500, "env.jump_weight", 30.0),
-        (900, "ppo.desired_kl", 0.004),
+        (500, "env.jump_weight", 20.0),
     ),
     motion=MotionConfig(one_sided=("canter",), offsets=(0, 8, 16, 23, 24), standing_weight=0.0),
     env=EnvConfig(
@@ -53,6 +52,7 @@ CPU = Config(
         gamma=0.98,
         entropy=0.002,
         precision="auto",
+        averaging=0.96,
         initial_std=0.5,
         hidden=(256, 128, 64),
         critic_history=False,
@@ -115,6 +115,7 @@ QUICKSTART = replace(
     iterations=110,
     max_minutes=5.0,
     env=replace(CPU.env, num_robots=512, rhythm_weight=0.0),
+    ppo=replace(CPU.ppo, averaging=0.0),  # so early, yesterday's weights are worse ones
     imitation=replace(CPU.imitation, cloning=500),
 )
 SMOKE = replace(

@@ -262,6 +262,8 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     stand_ins = (parts.estimation_loss, parts.adaptation_loss)
     metrics |= fit(stand_ins, parts.adaptation_optimizer, batch, cfg.adaptation.minibatches, parts.generator)
     lap("adaptation")
+    if parts.averaged is not None:
+        parts.averaged.update_parameters(parts.bbc)
     metrics |= {f"task/{name}": value.mean() for name, value in batch["next", keys.REWARD_TERMS].items()}
     metrics |= {f"prior/{name}": p for name, p in zip(BEHAVIOURS, parts.prior.probabilities, strict=True)}
     metrics |= tracking_error(batch)

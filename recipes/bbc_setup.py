@@ -14,6 +14,7 @@ from hardware import training_device
 from held_fixed import INFERRED, privileged_loss
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 from torchrl.objectives.value import GAE
@@ -52,6 +53,7 @@ class Components:
     demonstrations: Demonstrations
     env: LocomotionEnv
     bbc: BasicBehaviourController
+    averaged: AveragedModel | None
     anchor: BasicBehaviourController | None
     critic: Critic
     discriminator: Discriminator
@@ -80,6 +82,7 @@ class Components:
         """What every process holds alike."""
         names = ["bbc", "critic", "discriminator", "predictor", "prior"]
         names += ["policy_optimizer", "imitation_optimizer", "adaptation_optimizer"]
+        names += ["averaged"] if self.averaged is not None else []
         return {name: getattr(self, name) for name in names}
 
     @property
@@ -170,6 +173,7 @@ def build(cfg: Config) -> Components:
         ),
         env=env,
         bbc=bbc,
+        averaged=AveragedModel(bbc, multi_avg_fn=get_ema_multi_avg_fn(ppo.averaging)) if ppo.averaging else None,
         anchor=anchor,
         critic=critic,
         discriminator=discriminator,
@@ -225,7 +229,8 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=parts.env.dt, data=data)
     manifest |= {"network": parts.bbc.settings, "prior": parts.prior.probabilities.tolist()}
     manifest["simulation"] = {"friction_loss": cfg.env.friction_loss}
-    Artifact.save(folder / "policy", parts.bbc.state_dict(), manifest)
+    averaged = parts.averaged is not None and parts.averaged.n_averaged > 0
+    Artifact.save(folder / "policy", (parts.averaged.module if averaged else parts.bbc).state_dict(), manifest)
     layouts = {"motion": features.MOTION_LAYOUT}
     manifest = build_manifest("discriminator", layouts, control_period=parts.env.dt, data=data)
     manifest["network"] = {

@@ -25,16 +25,15 @@ STANCE_WIDTH = 0.15
 SHARPNESS = 8.0
 """Of the agreement between phases: a twelfth of a stride aside counts a third."""
 
-_FIGURES = ("frequency", "duty", "speed", "frequency_growth", "duty_growth", "share")
+_FIGURES = ("frequency", "speed", "growth", "duty", "share")
 _REAL = ("power", "mean", "last", "stance", "fresh")
 
 
 class Rhythm:
     r"""Short memory of the fore-aft motion of the feet, and how much of it follows a dog's pattern.
 
-    Told to go at :math:`v^*`, a dog of that behaviour strides at :math:`f = f_0 + g_f\,(|v^*| - v_0)`, at least
-    :math:`f_0 / 2`, and each of its feet stands for a share :math:`d^* = d_0 + g_d\,(|v^*| - v_0)` of the time. A
-    resonator at f follows each foot's fore-aft position x about its mean,
+    A resonator at the behaviour's stride frequency :math:`f = f_0 + g\,(|v^*| - v_0)`, at least :math:`f_0 / 2`,
+    follows each foot's fore-aft position x about its mean,
 
     .. math:: \dot z_i = \left(2 \pi i f - \tfrac{f}{0.6}\right) z_i + \tfrac{f}{0.6}\,(x_i - \bar x_i),
 
@@ -53,15 +52,13 @@ class Rhythm:
 
     Args:
         num_robots: N.
-        patterns: ``[5]`` with ``frequency`` [Hz] :math:`f_0`, ``duty`` :math:`d_0`, ``speed`` [m/s] :math:`v_0`,
-            ``frequency_growth`` [1/m] :math:`g_f`, ``duty_growth`` [s/m] :math:`g_d`, ``share`` s, ``phase`` and
-            ``mirrored_phase`` [5, 6] [strides], as
+        patterns: ``[5]`` with ``frequency`` [Hz] :math:`f_0` at ``speed`` [m/s] :math:`v_0`, ``growth`` [1/m] g,
+            ``duty`` :math:`d^*`, ``share`` s, ``phase`` and ``mirrored_phase`` [5, 6] [strides], as
             :func:`agility_rl.motion.stride_patterns.stride_patterns` makes them; where it is, the tensors are.
 
     Example:
         >>> from tensordict import TensorDict
-        >>> pattern = {name: torch.ones(5) for name in ("frequency", "speed", "share")}
-        >>> pattern |= {name: torch.zeros(5) for name in ("frequency_growth", "duty_growth")}
+        >>> pattern = {name: torch.ones(5) for name in ("frequency", "speed", "growth", "share")}
         >>> pattern |= {"duty": torch.full((5,), 0.5), "phase": torch.zeros(5, 6), "mirrored_phase": torch.zeros(5, 6)}
         >>> rhythm = Rhythm(1, TensorDict(pattern, [5]))
         >>> trot = torch.tensor([2])
@@ -74,7 +71,7 @@ class Rhythm:
 
     def __init__(self, num_robots: int, patterns: TensorDictBase) -> None:
         device = patterns["frequency"].device
-        self._figures = torch.stack([patterns[name] for name in _FIGURES], -1)  # [5, 6]
+        self._figures = torch.stack([patterns[name] for name in _FIGURES], -1)  # [5, 5]
         self._images = torch.stack([patterns[name] for name in ("phase", "mirrored_phase")], 1)  # [5, 2, 6]
         self._swing = torch.zeros(num_robots, 4, dtype=torch.complex64, device=device)
         self._power, self._mean = (torch.zeros(num_robots, 4, device=device) for _ in range(2))
@@ -97,10 +94,8 @@ class Rhythm:
     def hear(self, position: Tensor, forward: Tensor, skill: Tensor, speed: Tensor, dt: float) -> Tensor:
         """The same, of fore-aft positions ``[N, 4]`` [m] of the feet, ``dt`` [s] after the last ones; the trunk goes
         ``forward`` ``[2, N]`` [m/s], now and on the mean, and is told to go at speeds ``[N]`` [m/s]."""
-        usual, usual_duty, usual_speed, frequency_growth, duty_growth, dogs_share = self._figures[skill].unbind(-1)
-        faster = speed - usual_speed
-        step = dt * torch.maximum(usual + frequency_growth * faster, 0.5 * usual)[:, None]
-        duty = usual_duty + duty_growth * faster
+        usual, usual_speed, growth, duty, dogs_share = self._figures[skill].unbind(-1)
+        step = dt * torch.maximum(usual + growth * (speed - usual_speed), 0.5 * usual)[:, None]
         self._swing = self._swing.masked_fill(self._fresh, 0.0)
         self._power = self._power.masked_fill(self._fresh, 0.0)
         mean = torch.where(self._fresh, position, self._mean)

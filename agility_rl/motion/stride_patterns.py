@@ -25,18 +25,6 @@ Source: median stride frequencies of the dogs walking in the unlabelled clips, 0
 1.12 at 0.34, 1.17 at 0.43, 1.37 at 0.54 (85 stretches of 3 s). Galloping dogs hardly change theirs (Heglund, Taylor
 and McMahon 1974, Science 186:1112)."""
 
-DUTY_GROWTH = {"walk": -0.5, "canter": -0.06}
-"""Share of time for which a foot stands more for each m/s faster [s/m]. The walk is commanded from standing on: a robot
-that has to stand as shortly on the spot as its clips do at 0.15 m/s is as well off standing still. The canter is
-commanded at 0.8 to 2 m/s, its clips run at 1.9 to 3.3, and who has to stand as shortly as they do goes faster than
-told. Others keep their clips'.
-
-Source: :func:`~agility_rl.motion.gait_analysis.stance_share` of the dogs in the unlabelled clips. Walking, medians
-0.84 at 0.04 m/s, 0.65 at 0.14, 0.56 at 0.25, 0.57 at 0.35, 0.51 at 0.57 (228 stretches of 3 s): -0.74 by least
-squares, of which -0.5 leaves out the dogs that stand half of the time. Cantering, 0.47 at 0.86 m/s, 0.41 at 1.23,
-0.35 at 1.66, 0.32 at 2.11 (56 stretches of 1.2 s), and 0.31 at 2.38 in the labelled ones: -0.1. Six tenths of that keep
-the mean over the commanded speeds within 25 % of the labelled clips."""
-
 
 def mirrored(cross: Tensor) -> Tensor:
     """Cross-spectra ``[*B, 6]`` of the same gait in a mirror: left feet are right ones.
@@ -62,11 +50,11 @@ def stride_patterns(clips: Sequence[MotionClip]) -> TensorDict:
         clips: with labels.
 
     Returns:
-        ``[5]`` in the order of :data:`~agility_rl.behaviours.BEHAVIOURS`: ``frequency`` [Hz] and ``duty``, the
-        share of time in which a foot stands, at ``speed`` [m/s], and how they grow with that, ``frequency_growth``
-        [1/m] and ``duty_growth`` [s/m]; ``share``, how much of the mean square of the feet's motion a sine of that
-        frequency is; ``phase`` and ``mirrored_phase`` ``[5, 6]`` [strides], in the order of
-        :data:`~agility_rl.go2.constants.FOOT_PAIRS`, how far the first foot is ahead of the second.
+        ``[5]`` in the order of :data:`~agility_rl.behaviours.BEHAVIOURS`: ``frequency`` [Hz] at ``speed`` [m/s] and
+        how it grows with that, ``growth`` [1/m]; ``duty``, the share of time in which a foot stands; ``share``, how
+        much of the mean square of the feet's motion a sine of that frequency is; ``phase`` and ``mirrored_phase``
+        ``[5, 6]`` [strides], in the order of :data:`~agility_rl.go2.constants.FOOT_PAIRS`, how far the first foot is
+        ahead of the second.
 
     Raises:
         MotionError: if a behaviour has no clip.
@@ -91,13 +79,10 @@ def stride_patterns(clips: Sequence[MotionClip]) -> TensorDict:
             total = total + torch.where(nearer, image, cross)
         crosses.append(total)
     whole, (frequency, speed, share, duty) = torch.stack(crosses), torch.stack(figures, 1)
-    frequency_growth, duty_growth = (
-        torch.tensor([growth.get(name, 0.0) for name in BEHAVIOURS]) for growth in (FREQUENCY_GROWTH, DUTY_GROWTH)
-    )
+    growth = torch.tensor([FREQUENCY_GROWTH.get(name, 0.0) for name in BEHAVIOURS])
     phases = {"phase": whole.angle() / (2 * torch.pi), "mirrored_phase": mirrored(whole).angle() / (2 * torch.pi)}
-    means = {"frequency": frequency, "duty": duty, "speed": speed, "share": share}
-    growths = {"frequency_growth": frequency_growth, "duty_growth": duty_growth}
-    return TensorDict({**means, **growths, **phases}, [len(BEHAVIOURS)])
+    pace = {"frequency": frequency, "speed": speed, "growth": growth, "duty": duty, "share": share}
+    return TensorDict({**pace, **phases}, [len(BEHAVIOURS)])
 
 
 def _spectrum(clip: MotionClip) -> tuple[Tensor, Tensor]:

@@ -246,6 +246,28 @@ def run_two(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=300, env=ONE_THREAD)
 
 
+def test_what_is_saved_is_the_moving_average_of_weights(module: Callable[[str], ModuleType], tmp_path: Path) -> None:
+    recipe, setup, presets = module("bbc_pretrain"), module("bbc_setup"), module("bbc_presets")
+    assert presets.CPU.ppo.averaging > 0.0 and presets.PAPER.ppo.averaging == 0.0
+    cfg = replace(presets.SMOKE, ppo=replace(presets.SMOKE.ppo, averaging=0.75))
+    parts = setup.build(cfg)
+    recipe.begin(parts, cfg)
+    setup.save_policy(parts, cfg, tmp_path / "start")  # nothing to average yet
+    history = [{name: tensor.clone() for name, tensor in parts.bbc.state_dict().items()}]
+    for iteration in range(3):
+        recipe.iterate(parts, cfg, iteration)
+        history.append({name: tensor.clone() for name, tensor in parts.bbc.state_dict().items()})
+    setup.save_policy(parts, cfg, tmp_path / "end")
+    parts.env.close()
+    start, end = (Artifact.load(tmp_path / name / "policy").state for name in ("start", "end"))
+    for name, first in history[0].items():
+        assert torch.equal(start[name], first)
+        one, two, three = (state[name] for state in history[1:])
+        torch.testing.assert_close(end[name], 0.75 * (0.75 * one + 0.25 * two) + 0.25 * three)
+    moved = [name for name, last in history[-1].items() if not torch.equal(end[name], last)]
+    assert any("actor" in name for name in moved)
+
+
 def test_two_processes_train_one_policy_and_resume_bit_for_bit(tmp_path: Path) -> None:
     printed = run_two(tmp_path, "--name", "whole", "--iterations", "4").stdout
     assert printed.count("saved") == 1, "one of them writes"
