@@ -229,8 +229,10 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=parts.env.dt, data=data)
     manifest |= {"network": parts.bbc.settings, "prior": parts.prior.probabilities.tolist()}
     manifest["simulation"] = {"friction_loss": cfg.env.friction_loss}
-    averaged = parts.averaged is not None and parts.averaged.n_averaged > 0
-    Artifact.save(folder / "policy", (parts.averaged.module if averaged else parts.bbc).state_dict(), manifest)
+    shown: torch.nn.Module = parts.bbc
+    if parts.averaged is not None and parts.averaged.n_averaged > 0:
+        shown = parts.averaged.module
+    Artifact.save(folder / "policy", shown.state_dict(), manifest)
     layouts = {"motion": features.MOTION_LAYOUT}
     manifest = build_manifest("discriminator", layouts, control_period=parts.env.dt, data=data)
     manifest["network"] = {

@@ -16,8 +16,8 @@ from agility_rl.go2.features import in_stance
 
 MEMORY = 0.6
 """Strides after which what a foot did counts 1/e: less blurs the phase, more hides a wrong stride frequency."""
-REST = 0.016
-"""Fore-aft motion [m] beside which a standing robot's trembling is no stride."""
+REST = 0.006
+"""Fore-aft motion [m] beside which a standing robot's trembling is no stride, but a step on the spot is."""
 STANCE_MEMORY = 2.0
 """Strides after which whether a foot stood counts 1/e."""
 STANCE_WIDTH = 0.15
@@ -42,7 +42,7 @@ class Rhythm:
     beside the dogs' own share s, times the agreements of the duty factor and of the phases with the pattern's or its
     mirror image's, is
 
-    .. math:: \min\left(1, \frac{1}{s} \frac{2 \sum |z_i|^2}{\sum p_i + 4 \cdot 0.016^2}\right)
+    .. math:: \min\left(1, \frac{1}{s} \frac{2 \sum |z_i|^2}{\sum p_i + 4 \cdot 0.006^2}\right)
               \exp\left(-\frac{(d - d^*)^2}{0.15^2}\right)
               \max_{\phi^*} \frac{1}{6} \sum_{ij} e^{8 (\cos 2\pi(\phi_{ij} - \phi^*_{ij}) - 1)},
               \quad \phi_{ij} = \tfrac{1}{2\pi} \arg z_i \bar z_j.

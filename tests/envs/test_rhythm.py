@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from agility_rl.envs.rewards import rhythm
-from agility_rl.envs.rhythm import MEMORY, SHARPNESS, STANCE_WIDTH, Rhythm
+from agility_rl.envs.rhythm import MEMORY, REST, SHARPNESS, STANCE_WIDTH, Rhythm
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants, kinematics
 
@@ -64,7 +64,9 @@ def test_where_the_feet_swing_about_and_how_far_does_not_count() -> None:
     right = heard(TROT, 2.0, pattern)
     assert heard(TROT, 2.0, pattern, offset=0.2, seconds=12.0) == pytest.approx(right, abs=0.02)
     assert heard(TROT, 2.0, pattern, amplitude=0.2) == pytest.approx(right, abs=0.05)
-    assert heard(TROT, 2.0, pattern, amplitude=1e-3) < 0.01, "trembling is no stride"
+    trembling = 0.5e-3**2 / (0.5e-3**2 + 2.0 * REST**2)
+    assert trembling < 0.01
+    assert heard(TROT, 2.0, pattern, amplitude=0.5e-3) == pytest.approx(trembling * right, rel=0.1)
 
 
 @pytest.mark.parametrize("detuned", [0.25, 0.5, 1.0])
