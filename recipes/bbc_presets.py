@@ -97,6 +97,7 @@ POLISH = replace(
         desired_kl=0.006,
         entropy=0.0005,
         critic_warm_up=20,
+        averaging=0.0,  # what this preset made was made without
     ),
     imitation=replace(
         CPU.imitation,
@@ -115,7 +116,7 @@ QUICKSTART = replace(
     iterations=110,
     max_minutes=5.0,
     env=replace(CPU.env, num_robots=512, rhythm_weight=0.0),
-    ppo=replace(CPU.ppo, averaging=0.0),  # so early, yesterday's weights are worse ones
+    ppo=replace(CPU.ppo, averaging=0.0),  # 110 iterations of fast learning are too few to average over 25
     imitation=replace(CPU.imitation, cloning=500),
 )
 SMOKE = replace(
