@@ -105,8 +105,8 @@ class PPOConfig:
     compile: bool = False
     """Fuse PPO's loss by ``torch.compile``: a minute once, then a faster update (docs/gpu.md)."""
     averaging: float = 0.0
-    """What is saved is a moving average of the controller's weights with this decay an iteration: behaviours that come
-    and go between two checkpoints are then there in both. 0: the last weights."""
+    """What is saved is a moving average of the controller's weights with this decay an iteration, so that less hangs on
+    which iteration was the last; 0: the last weights. Ours (docs/bbc.md, The rhythm)."""
     initial_std: float = 1.0
     min_std: float = 0.1
     hidden: tuple[int, ...] = (512, 256, 128)
