@@ -43,6 +43,8 @@ class EnvConfig:
     steepness: float = 0.4
     """Slope of its pyramids at difficulty 1; they are drawn at 0, 0.2 and 0.4 of it (method notes, section 4.5). Of
     ridges: the largest; strips have all of it, half of it or none."""
+    encounters: float = 0.0
+    """Share of the commands on which a bar (before canter and jump) or a ramp lies in the way (ours)."""
     randomize: bool = True
     push_interval: float | None = 8.0
     """Seconds (released code)."""
@@ -64,6 +66,8 @@ class EnvConfig:
     """Weight that is left of it; without any, a slow walk turns into standing."""
     turn_weight: float = 0.0
     """Weight of a reward for turning as fast as commanded that has a slope everywhere (ours)."""
+    lateral_weight: float = 0.0
+    """Weight of a reward for going sideways as fast as commanded, and no faster, that has a slope everywhere (ours)."""
     rhythm_weight: float = 0.0
     """Weight of a reward for the stride frequency and the foot phases of the behaviour's labelled clips (ours)."""
     collision_weight: float = -10.0
@@ -107,6 +111,9 @@ class PPOConfig:
     averaging: float = 0.0
     """What is saved is a moving average of the controller's weights with this decay an iteration, so that less hangs on
     which iteration was the last; 0: the last weights. Ours (docs/bbc.md, The rhythm)."""
+    symmetry: float = 0.0
+    """Weight of acting in a mirror as the mirror image does (squared distance of the mean actions), of behaviours that
+    are not ``--motion.one-sided`` (ours). Without it a controller turns better to one side."""
     initial_std: float = 1.0
     min_std: float = 0.1
     hidden: tuple[int, ...] = (512, 256, 128)

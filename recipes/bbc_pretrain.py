@@ -21,15 +21,16 @@ from pathlib import Path
 import torch
 from bbc_cloning import clone_behaviour
 from bbc_config import Config, ImitationConfig, at, check_changes
+from bbc_penalties import asymmetry, distance_to_anchor, hold
 from bbc_presets import PRESETS
-from bbc_setup import ANCHORED, Components, build, save_policy
+from bbc_setup import Components, build, save_policy
 from held_fixed import fit, infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from training_run import Laps, own_options, run
 
 from agility_rl import keys
-from agility_rl.behaviours import BEHAVIOURS, COMMANDS
+from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.go2 import features
 from agility_rl.losses import functional
@@ -163,25 +164,6 @@ def speed_share(parts: Components, batch: TensorDictBase) -> Tensor:
     return batch["next", keys.REWARD_TERMS, "velocity_progress"] / (term.weight * parts.env.dt)
 
 
-@torch.no_grad()
-def hold(parts: Components, batch: TensorDictBase) -> None:
-    """Write the anchor's mean action beside the experience."""
-    assert parts.anchor is not None
-    policy = parts.anchor.trained_actor()[:-1]
-    flat = policy(batch.select(*policy.in_keys).flatten())
-    batch[ANCHORED] = flat["loc"].unflatten(0, batch.batch_size)
-
-
-def distance_to_anchor(parts: Components, sample: TensorDictBase, turn_rate: float | None) -> Tensor:
-    """Mean squared difference between the mean actions of policy and anchor [action units squared]; zero where a faster
-    turn than ``turn_rate`` [rad/s] is commanded."""
-    policy = parts.bbc.trained_actor()[:-1]
-    error = (policy(sample.select(*policy.in_keys))["loc"] - sample[ANCHORED]).square().mean(-1)
-    if turn_rate is not None:
-        error = error * (sample[keys.COMMAND][:, COMMANDS.index("yaw_rate")].abs() <= turn_rate)
-    return error.mean()
-
-
 def begin(parts: Components, cfg: Config) -> None:
     """Where a new run starts from: labels for Q^c, and another run's policy or the labelled clips."""
     warm_up_predictor(parts, cfg.imitation)
@@ -245,6 +227,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
             infer(parts.bbc.history_encoder, batch)
         if parts.anchor is not None:
             hold(parts, batch)
+        one_sided = torch.tensor([name in cfg.motion.one_sided for name in BEHAVIOURS], device=batch.device)
         kept = cfg.imitation.cloning_weight
         kept -= functional.linear_ramp(iteration, *cfg.imitation.cloning_fade, kept)
 
@@ -255,6 +238,8 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
             if parts.anchor is not None:
                 away = distance_to_anchor(parts, sample, cfg.imitation.anchor_turn_rate)
                 loss = loss + cfg.imitation.anchor * away
+            if cfg.ppo.symmetry:
+                loss = loss + cfg.ppo.symmetry * asymmetry(parts, sample, one_sided)
             return loss
 
         metrics |= parts.ppo(batch, parts.generator, extra, critic_only=iteration < cfg.ppo.critic_warm_up)

@@ -192,7 +192,7 @@ def build(cfg: Config) -> Components:
             epochs=ppo.epochs,
             minibatches=ppo.minibatches,
             max_grad_norm=ppo.max_grad_norm,
-            keep=["loc", "scale", INFERRED, ANCHORED],
+            keep=["loc", "scale", INFERRED, ANCHORED, keys.SKILL],
             divergence=divergence,
             schedule=schedule,
             precision=hidden_precision(ppo.precision, device),

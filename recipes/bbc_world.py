@@ -20,6 +20,7 @@ from agility_rl.envs.rewards import (
     RewardTerm,
     jump_height_peak,
     jump_height_window,
+    lateral_progress,
     rhythm,
     turn_progress,
     velocity_progress,
@@ -55,6 +56,7 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
         push_interval=cfg.env.push_interval,
         episode_length=cfg.env.episode_length,
         patterns=stride_patterns(dataset.labelled_clips) if cfg.env.rhythm_weight else None,
+        encounters=cfg.env.encounters,
         motion_offsets=cfg.motion.offsets,
         seed=seeds.integer("environment"),
     )
@@ -69,6 +71,8 @@ def rewards(cfg: EnvConfig) -> dict[str, RewardTerm]:
         terms["velocity_progress"] = RewardTerm(cfg.progress_weight, velocity_progress)
     if cfg.turn_weight:
         terms["turn_progress"] = RewardTerm(cfg.turn_weight, turn_progress)
+    if cfg.lateral_weight:
+        terms["lateral_progress"] = RewardTerm(cfg.lateral_weight, lateral_progress)
     if cfg.rhythm_weight:
         terms["rhythm"] = RewardTerm(cfg.rhythm_weight, rhythm)
     terms["collision"] = terms["collision"]._replace(weight=cfg.collision_weight)

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from tsc_artifacts import load_bbc_of, load_trained
 from tsc_config import Config as TeacherConfig
-from tsc_script import Script
+from tsc_script import read
 
 from agility_rl import behaviours, keys
 from agility_rl.envs import AgilityEnv
@@ -145,17 +145,17 @@ def load_script(text: str, bbc: Path | None) -> Decider:
     """What a script decides.
 
     Args:
-        text: as :meth:`Script.parse` reads it.
+        text: as :func:`tsc_script.read` reads it.
         bbc: folder of the controller; that of the teachers by default.
 
     Raises:
         ValueError: if it is no script.
     """
-    script = Script.parse(text)
+    script = read(text)
     if not script.complete:
         raise ValueError(
             f"--script: {text!r} leaves decisions to a teacher, and there is none; say what it does usually"
         )
-    label = "script_" + text.replace(":", "_").replace(",", "_").replace("=", "_")
     controller = load_controller(bbc or TeacherConfig().bbc)
+    label = "script_" + text.replace(":", "_").replace(",", "_").replace("=", "_")
     return Decider(script.decide, 1, controller, label, None, None, "full", script.behaviours)

@@ -14,14 +14,15 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 from tsc_config import CloningConfig
-from tsc_script import Script
+from tsc_guide import Guide
+from tsc_script import Script, read
 from tsc_setup import Components
 
 from agility_rl import keys
 from agility_rl.training.seeding import permutation
 
-READ = (keys.OBSTACLE, keys.HEADING_ERROR)
-"""What a script reads."""
+READ = (keys.OBSTACLE, keys.HEADING_ERROR, keys.PLACE)
+"""What a script or the guide reads."""
 
 
 def clone(parts: Components, cfg: CloningConfig) -> dict[str, float]:
@@ -35,7 +36,7 @@ def clone(parts: Components, cfg: CloningConfig) -> dict[str, float]:
     Raises:
         ValueError: if the script is none.
     """
-    script = Script.parse(cfg.script, "--cloning.script")
+    script = read(cfg.script, "--cloning.script")
     actor = parts.teacher.trained_actor()
     networks = actor[:-1]  # up to the distribution
     before = copy.deepcopy(networks).requires_grad_(False)
@@ -98,7 +99,7 @@ def imitation(said: TensorDictBase, label: TensorDictBase) -> dict[str, Tensor]:
     }
 
 
-def led(parts: Components, script: Script, number: int) -> Callable[[TensorDictBase], TensorDictBase]:
+def led(parts: Components, script: Script | Guide, number: int) -> Callable[[TensorDictBase], TensorDictBase]:
     """The teacher as a policy in whose place a script drives the first robots."""
     own = parts.teacher.privileged_policy()
 

@@ -111,7 +111,8 @@ class CloningConfig:
     iterations: int = 0
     """Roll-outs in which the teacher copies a script before it learns by itself (ours; 0: not at all)."""
     script: str = "trot:1.2"
-    """BEHAVIOUR:SPEED, and OBSTACLE=BEHAVIOUR:SPEED after commas, as ``evaluate_course.py --script`` takes it. With
+    """BEHAVIOUR:SPEED, and OBSTACLE=BEHAVIOUR:SPEED after commas, as ``evaluate_course.py --script`` takes it, or
+    ``guide``, which knows where robots stand (``--place`` lets the teacher know too). With
     ``own`` in place of the first, a teacher of ``--init-from`` is corrected before those and keeps the rest;
     ``own/trot:0.6`` corrects it only while the way-point is more than 0.5 rad aside."""
     scripted: float = 0.5

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from tsc_guide import Guide
 
 from agility_rl import behaviours, keys
 from agility_rl.envs.decisions import NUM_PARAMETERS
@@ -22,6 +23,19 @@ OWN = "own"
 ASIDE = 0.5
 """Heading error from which the second decision of ``FIRST/SECOND`` holds [rad]."""
 TURN = behaviours.COMMANDS.index("yaw_rate")
+
+
+GUIDE = "guide"
+"""In place of a script: :class:`Guide`, which knows where robots stand."""
+
+
+def read(text: str, option: str = "--script") -> Script | Guide:
+    """What leads robots: ``guide``, or a script (:meth:`Script.parse`).
+
+    Raises:
+        ValueError: if it is neither.
+    """
+    return Guide() if text == GUIDE else Script.parse(text, option)
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from torch import Tensor
 from training_run import Laps, own_options, run
 from tsc_cloning import clone
 from tsc_config import PRESETS, Config
-from tsc_script import Script
+from tsc_script import read
 from tsc_setup import Components, build, save_policy
 
 from agility_rl import keys
@@ -111,7 +111,7 @@ def begin(parts: Components, cfg: Config) -> None:
 
 def copies(cfg: Config) -> bool:
     """Whether a new run copies its script: one that starts from a teacher does so where the script says ``own``."""
-    complete = Script.parse(cfg.cloning.script, "--cloning.script").complete
+    complete = read(cfg.cloning.script, "--cloning.script").complete
     return cfg.cloning.iterations > 0 and complete == (cfg.init_from is None)
 
 
@@ -120,7 +120,7 @@ def train(cfg: Config) -> Path:
     cfg = own_options(cfg)
     if unknown := sorted(set(cfg.behaviours) - set(BEHAVIOURS)):
         raise ValueError(f"--behaviours: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
-    script = Script.parse(cfg.cloning.script, "--cloning.script")
+    script = read(cfg.cloning.script, "--cloning.script")
     if not script.complete and cfg.init_from is None and cfg.resume is None:
         raise ValueError(
             f"--cloning.script {cfg.cloning.script} keeps what a teacher does; give it by --init-from, or a script "

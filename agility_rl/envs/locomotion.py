@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.commands import CommandSampler
+from agility_rl.envs.encounters import PIECES, Encounters
 from agility_rl.envs.observations import ObservationGroups
 from agility_rl.envs.randomization import Randomization, uniform
 from agility_rl.envs.reference import ReferenceStates
@@ -59,13 +60,14 @@ class LocomotionEnv(EnvBase):
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
         patterns: rhythm of each behaviour, as :class:`agility_rl.envs.rhythm.Rhythm` takes them, for the reward term
             ``rhythm``; ``None`` hears none.
+        encounters: share of the commands on which a bar or a ramp lies in the way (:class:`Encounters`).
         motion_offsets: which discriminator frames ``motion`` holds, in control steps from the oldest; ``[N, H, 49]``
             then has their number H. With ``past_motion`` in the reference, those before an episode are the dog's.
         seed: seed of all randomness in the environment.
 
     Raises:
-        ValueError: if the simulator holds another number of robots, a reference entry is missing or too short, a
-            behaviour has no reference state, or the offsets do not rise from zero.
+        ValueError: if the simulator holds another number of robots or not what lies in the way, a reference entry is
+            missing or too short, a behaviour has no reference state, or the offsets do not rise from zero.
 
     Example:
         >>> env = LocomotionEnv(2, simulator_options={"num_threads": 1})
@@ -91,15 +93,22 @@ class LocomotionEnv(EnvBase):
         push_interval: float | None = None,
         push_velocity: float = 0.5,
         patterns: TensorDictBase | None = None,
+        encounters: float = 0.0,
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
         seed: int = 0,
     ) -> None:
-        simulator = simulator or make_simulator(num_simulations=num_robots, **(simulator_options or {}))
+        pieces = PIECES if encounters else ()
+        engine = {"scenery": pieces, **(simulator_options or {})}
+        simulator = simulator or make_simulator(num_simulations=num_robots, **engine)
         super().__init__(device=simulator.device, batch_size=torch.Size([num_robots]))
         self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
         self.simulator, device = simulator, simulator.device
         if self.simulator.num_simulations != num_robots:
             raise ValueError(f"the simulator holds {self.simulator.num_simulations} robots, expected {num_robots}")
+        if tuple(self.simulator.scenery) != pieces:
+            raise ValueError(
+                "with encounters the simulator must hold agility_rl.envs.encounters.PIECES, else no scenery"
+            )
         self.dt = self.simulator.control_dt
         self.rewards = dict(rewards)
         self.terminations = tuple(terminations)
@@ -116,7 +125,8 @@ class LocomotionEnv(EnvBase):
         n = num_robots
         interval = None if push_interval is None else round(push_interval / self.dt)
         self.pushes = Pushes(n, self.generator, interval, push_velocity)
-        self.robots = Robots(self.simulator, self.generator)
+        self.encounters = Encounters(n, self.generator, encounters) if encounters else None
+        self.robots = Robots(self.simulator, self.generator, self._ground)
         self.rhythm = None if patterns is None else Rhythm(n, patterns.to(device))
         self._step_count = torch.zeros(n, dtype=torch.int64, device=device)
         self._make_specs(n)
@@ -181,6 +191,8 @@ class LocomotionEnv(EnvBase):
         if self.commands.period is not None:
             self.commands.resample(mask)
         past = self._place(mask)
+        if self.encounters is not None:
+            self.encounters.begin(mask, self.simulator, self.commands)
         if self.randomization is not None:
             self.robots.randomize(mask, self.randomization)
         self._step_count = self._step_count.masked_fill(mask, 0)
@@ -213,6 +225,8 @@ class LocomotionEnv(EnvBase):
         truncated = ((self._step_count >= self.max_steps) | self._at_edge())[:, None] & ~terminated
 
         self.commands.advance()
+        if self.encounters is not None:
+            self.encounters.advance(self.simulator, self.commands)
         self.observations.update(state)
         self.robots.remember(state)
         observation = self.observations.build(state, self.commands, self.robots.privileged)
@@ -243,6 +257,11 @@ class LocomotionEnv(EnvBase):
         )
         return None if past is None else past[number[mask]]
 
+    def _ground(self, position: Tensor) -> Tensor:
+        """Height [m] of what robots stand on under horizontal positions ``[N, 2]``, as ``[N]``."""
+        height = self.simulator.ground_height(position)
+        return height if self.encounters is None else height + self.encounters.ground(position)
+
     def _at_edge(self) -> Tensor:
         """Who has come to the edge of a height field, beyond which there is nothing to walk on."""
         beyond = self.simulator.root_position[:, :2].abs().amax(-1) - self.simulator.ground_extent
@@ -256,6 +275,7 @@ class LocomotionEnv(EnvBase):
             "commands": self.commands.state_dict(),
             "observations": self.observations.state_dict(),
             **({} if self.rhythm is None else {"rhythm": self.rhythm.state_dict()}),
+            **({} if self.encounters is None else {"encounters": self.encounters.state_dict()}),
             "buffers": {
                 "step_count": self._step_count.clone(),
                 "push_phase": self.pushes.phase.clone(),
@@ -271,6 +291,8 @@ class LocomotionEnv(EnvBase):
         self.observations.load_state_dict(state_dict["observations"])
         if self.rhythm is not None:
             self.rhythm.load_state_dict(state_dict["rhythm"])
+        if self.encounters is not None:
+            self.encounters.load_state_dict(state_dict["encounters"])
         buffers = state_dict["buffers"]
         self._step_count, self.pushes.phase = buffers["step_count"].clone(), buffers["push_phase"].clone()
         self.robots.load_state_dict(buffers)

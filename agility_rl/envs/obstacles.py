@@ -96,13 +96,21 @@ BAR_RADIUS, BAR_WIDTH = 0.03, 1.2
 WING_HEIGHT, WINGS_WIDTH = 0.42, 2.04
 
 
+def bar_shape(half_width: float) -> Shape:
+    """A bar across the way, at the height to which its piece is lifted.
+
+    Args:
+        half_width: half of its length [m].
+    """
+    return Shape("capsule", (BAR_RADIUS, half_width), quaternion=_ALONG_Y, colour=_RED)
+
+
 def _bar_jump() -> Obstacle:
     half, reach = BAR_WIDTH / 2, WINGS_WIDTH / 2
     wing = (0.02, (reach - half) / 2, WING_HEIGHT / 2)  # 4 cm thick: ours
     wings = tuple(
         Shape("box", wing, (0.0, side * (reach + half) / 2, WING_HEIGHT / 2), colour=_WHITE) for side in (1.0, -1.0)
     )
-    bar = Shape("capsule", (BAR_RADIUS, half), quaternion=_ALONG_Y, colour=_RED)
 
     def profile(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         deep = x.abs() <= GATE_DEPTH / 2
@@ -112,7 +120,7 @@ def _bar_jump() -> Obstacle:
 
     return Obstacle(
         "bar_jump",
-        (Piece("wings", wings), Piece("bar", (bar,))),
+        (Piece("wings", wings), Piece("bar", (bar_shape(half),))),
         ((-1.8, 0.0), (-0.9, 0.0), (0.0, 0.0), (0.9, 0.0)),
         (GATE_DEPTH / 2, reach),
         profile,
@@ -136,22 +144,36 @@ def _side_strips(half_length: float, half_width: float) -> tuple[Zone, ...]:
     return tuple(Zone(0.0, side * middle, half_length, EDGE_WIDTH / 2) for side in (1.0, -1.0))
 
 
-def _a_frame() -> Obstacle:
-    slope, half = math.atan2(APEX_HEIGHT, RAMP_LENGTH), RAMP_WIDTH / 2
-    board = (math.hypot(APEX_HEIGHT, RAMP_LENGTH) / 2, half, RAMP_THICKNESS / 2)
+def ramp_shapes(half_width: float) -> tuple[Shape, ...]:
+    """The two boards of an A-frame.
+
+    Args:
+        half_width: of the boards [m].
+    """
+    slope = math.atan2(APEX_HEIGHT, RAMP_LENGTH)
+    board = (math.hypot(APEX_HEIGHT, RAMP_LENGTH) / 2, half_width, RAMP_THICKNESS / 2)
     shapes = []
     for side in (1.0, -1.0):  # the tops of the boards meet at the apex
         x = side * (RAMP_LENGTH / 2 - RAMP_THICKNESS / 2 * math.sin(slope))
         z = APEX_HEIGHT / 2 - RAMP_THICKNESS / 2 * math.cos(slope)
         shapes.append(Shape("box", board, (x, 0.0, z), _turned(side * slope, "y"), _BLUE if side > 0 else _YELLOW))
+    return tuple(shapes)
+
+
+def ramp_height(x: Tensor) -> Tensor:
+    """Height of an A-frame's boards at local x [m]; 0 beside them."""
+    return (APEX_HEIGHT * (1.0 - x.abs() / RAMP_LENGTH)).clamp(min=0.0)
+
+
+def _a_frame() -> Obstacle:
+    half = RAMP_WIDTH / 2
 
     def profile(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        on = (x.abs() <= RAMP_LENGTH) & (y.abs() <= half)
-        return torch.where(on, APEX_HEIGHT * (1.0 - x.abs() / RAMP_LENGTH), 0.0), torch.zeros_like(x)
+        return torch.where(y.abs() <= half, ramp_height(x), 0.0), torch.zeros_like(x)
 
     return Obstacle(
         "a_frame",
-        (Piece("boards", tuple(shapes)),),
+        (Piece("boards", ramp_shapes(half)),),
         ((-RAMP_LENGTH - 0.7, 0.0), (-RAMP_LENGTH, 0.0), (0.0, 0.0), (RAMP_LENGTH, 0.0)),
         (RAMP_LENGTH, half),
         profile,

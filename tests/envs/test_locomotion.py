@@ -30,6 +30,7 @@ EVERYTHING: dict[str, Any] = {
     "episode_length": 0.5,
     "rewards": {**LOCOMOTION_REWARDS, "rhythm": RewardTerm(1.0, rhythm)},
     "patterns": stride_patterns([synthesize_gait(name) for name in BEHAVIOURS]),
+    "encounters": 0.8,
 }
 """All randomness there is, often."""
 

@@ -214,31 +214,6 @@ def test_a_gated_reward_is_paid_in_proportion_to_the_speed(module: Callable[[str
     parts.env.close()
 
 
-def test_an_anchor_holds_the_policy_to_the_one_it_started_from(
-    module: Callable[[str], ModuleType], finished: Path
-) -> None:
-    recipe, setup, presets = module("bbc_pretrain"), module("bbc_setup"), module("bbc_presets")
-    imitation = replace(presets.SMOKE.imitation, anchor=2.0)
-    parts = setup.build(replace(presets.SMOKE, imitation=imitation, init_from=finished / "whole"))
-    batch = parts.rollout.collect(parts.bbc.privileged_policy()).flatten()[:32]
-    recipe.hold(parts, batch)
-    parts.bbc.load_state_dict(parts.anchor.state_dict())
-    assert recipe.distance_to_anchor(parts, batch, None) == 0.0
-    linear = [layer for layer in parts.bbc.actor.modules() if isinstance(layer, torch.nn.Linear)]
-    with torch.no_grad():
-        linear[-1].bias += 0.3  # moves every mean action by as much
-    distance = recipe.distance_to_anchor(parts, batch, None)
-    torch.testing.assert_close(distance, torch.tensor(0.09))
-    straight = (batch["command"][:, 2].abs() <= 0.4).float().mean()
-    assert 0.0 < straight < 1.0
-    torch.testing.assert_close(recipe.distance_to_anchor(parts, batch, 0.4), 0.09 * straight)
-    distance.backward()
-    assert all(parameter.grad is None for parameter in parts.anchor.parameters())
-    assert any(parameter.grad is not None for parameter in parts.bbc.actor.parameters())
-    with pytest.raises(ValueError, match="anchor holds on to the policy of --init-from"):
-        setup.build(replace(presets.SMOKE, imitation=imitation))
-
-
 def run_two(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     """Two processes on one machine, as a user starts them."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "--standalone"]
@@ -294,8 +269,9 @@ def test_the_paper_preset_is_table_s1_and_the_supplement(module: Callable[[str],
     assert imitation.prior_temperature is None, "Algorithm S1, line 3: skills are drawn from the prior"
     assert imitation.criterion == "least_squares" and not imitation.conditional  # Eq. (10)
     assert paper.env.terrain == "rough" and paper.env.randomize and paper.env.push_interval  # section S2
-    ours = (paper.env.rhythm_weight, paper.env.progress_weight, paper.env.turn_weight, paper.motion.turns)
-    assert ours == (0.0, 0.0, 0.0, ()) and imitation.cloning == imitation.warm_up == imitation.gate == 0
+    ours = (paper.env.rhythm_weight, paper.env.progress_weight, paper.env.turn_weight, paper.env.lateral_weight)
+    assert ours == (0.0, 0.0, 0.0, 0.0) and paper.motion.turns == () and paper.ppo.symmetry == 0.0
+    assert imitation.cloning == imitation.warm_up == imitation.gate == 0
 
 
 def test_speed_and_turn_rate_errors_by_hand(module: Callable[[str], ModuleType]) -> None:

@@ -36,8 +36,11 @@ def test_only_rewards_with_a_weight_are_paid(module: Module) -> None:
     world, published = module("bbc_world"), module("bbc_config").EnvConfig()
     assert "turn_progress" not in (plain := world.rewards(published)) and "velocity_progress" not in plain
     assert plain["collision"].weight == -10.0  # supplement S4
-    ours = world.rewards(replace(published, turn_weight=3.0, progress_weight=2.0, jump_weight=5.0))
-    assert [ours[name].weight for name in ("turn_progress", "velocity_progress", "jump_height")] == [3.0, 2.0, 5.0]
+    assert "lateral_progress" not in plain
+    weights = {"turn_weight": 3.0, "progress_weight": 2.0, "jump_weight": 5.0, "lateral_weight": 4.0}
+    ours, names = world.rewards(replace(published, **weights)), ("turn", "velocity", "lateral")
+    assert [ours[f"{name}_progress"].weight for name in names] == [3.0, 2.0, 4.0]
+    assert ours["jump_height"].weight == 5.0
 
 
 def test_rough_ground_is_as_rough_and_steep_as_told(module: Module) -> None:

@@ -1,0 +1,137 @@
+"""A guide that knows where robots stand: it leads them onto the axis of the obstacle ahead, and over it.
+
+What a handler does with a young dog. A teacher may copy it before it learns by itself (``--cloning.script guide``), and
+``evaluate_course.py --script guide`` shows how far a controller gets that is led as well as geometry can.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from agility_rl import behaviours, keys, rotations
+from agility_rl.behaviours import skill_index
+from agility_rl.envs.decisions import NUM_PARAMETERS
+from agility_rl.envs.obstacles import OBSTACLES, POLE_SPACING
+
+
+@dataclass(frozen=True)
+class Passage:
+    """How an obstacle is passed.
+
+    Attributes:
+        start: local x before which the robot must be on the axis [m].
+        behaviour: shown on the obstacle.
+        speed: there [m/s].
+        tolerance: how far aside it may begin [m].
+        run_up: metres before :attr:`start` where :attr:`behaviour` begins.
+        beside: how far beside the axis it begins, to the right [m].
+    """
+
+    start: float
+    behaviour: str = "trot"
+    speed: float = 1.0
+    tolerance: float = 0.12
+    run_up: float = 0.0
+    beside: float = 0.0
+
+
+SWAY = 0.36
+"""Distance at which poles are passed [m]."""
+BEND = (SWAY**2 + (POLE_SPACING / 2) ** 2) / (2.0 * SWAY)
+"""Radius of the arcs around them [m]: one begins where the other ends, on the line of the poles."""
+PASSAGES: dict[str, Passage] = {
+    "bar_jump": Passage(-0.5, "canter", 1.6, 0.3, 0.9),
+    "a_frame": Passage(-1.5, speed=1.1),
+    "weave_poles": Passage(-1.5, speed=0.6, beside=SWAY),
+    "seesaw": Passage(-1.5, speed=0.9),
+    "tire_jump": Passage(-0.5, "canter", 1.6, 0.15, 0.9),
+    "tunnel": Passage(-1.1, speed=0.9),
+    "box_jump": Passage(-0.8, "jump", 1.4, 0.4, 0.6),
+}
+USUAL = "trot"
+"""Behaviour between obstacles."""
+CRUISE, SLOW = 1.2, 0.5
+"""Speed between obstacles, and in turns [m/s]."""
+LOOK_AHEAD, LEAST_LOOK_AHEAD = 0.9, 0.35
+"""Distance of the point on the axis that it heads for [m], far from the obstacle and close to it."""
+BESIDE, ROOM = 0.5, 0.6
+"""Who is farther aside heads for a point so far before the obstacle [m]: there is room to turn."""
+STEERING = 2.5
+"""Turn rate that is commanded for each radian of heading error [1/s]."""
+SIDEWAYS = 1.0
+"""Sideways speed for each metre beside the axis [1/s]."""
+ALIGNED = 0.25
+"""Heading error up to which it runs as fast as it may [rad]."""
+
+
+class Guide:
+    """Decisions from ``keys.PLACE`` and the type of the obstacle; deterministic, without memory.
+
+    Attributes:
+        complete: it says something before every obstacle.
+        behaviours: those that it chooses.
+
+    Example:
+        >>> place = torch.tensor([[1.0, 0.0, 2.0, 0.0, -3.0, 0.0, 0.0, 1.0]])  # on the axis, 3 m before the middle
+        >>> td = TensorDict({"place": place, "obstacle": torch.eye(7)[1:2]}, [1])  # of an A-frame
+        >>> Guide().decide(td)["action", "behaviour"]
+        tensor([2])
+    """
+
+    complete = True
+
+    def __init__(self) -> None:
+        self.behaviours = tuple(sorted({USUAL, *(passage.behaviour for passage in PASSAGES.values())}))
+        passages = [PASSAGES[name] for name in OBSTACLES]
+        self._figures = torch.tensor([[p.start, p.speed, p.tolerance, p.run_up, p.beside] for p in passages])
+        self._skill = torch.tensor([skill_index(p.behaviour) for p in passages])
+
+    def decide(self, td: TensorDictBase) -> TensorDictBase:
+        """Decisions of ``N`` robots under ``action``."""
+        kind, place = td[keys.OBSTACLE].argmax(-1), td[keys.PLACE]
+        start, speed, tolerance, run_up, beside = self._figures.to(place.device)[kind].unbind(-1)
+        x, y, sine, cosine = place[:, 4:].unbind(-1)
+        heading, left = torch.atan2(sine, cosine), start - x  # ``left``: way that is left to come onto the axis
+        line = torch.where(x > 0.0, beside, -beside)  # poles: begun on their right side, left on their left
+        off = y - line
+        far = (off.abs() > BESIDE) & (x < torch.where(beside > 0.0, start, 0.0))
+        aim = x + (0.6 * left).clamp(LEAST_LOOK_AHEAD, LOOK_AHEAD)
+        aim = torch.where(far, torch.minimum(aim, start - ROOM), aim)
+        wanted = torch.atan2(-off, aim - x)
+        weaving = (beside > 0.0) & (x > start) & (x < -start)
+        around, bend = self._around_poles(x, y)
+        wanted = torch.where(weaving, around, wanted)
+        error = rotations.wrap_angle(wanted - heading)
+        on_line = (off.abs() < tolerance) & (error.abs() < ALIGNED)
+        passing = weaving | ((left < 0.0) & ~far) | ((left < run_up) & on_line)
+        skill = torch.where(passing, self._skill.to(place.device)[kind], skill_index(USUAL))
+        calm = torch.exp(-((error.abs() - ALIGNED).clamp(min=0.0) / 0.4).square())
+        late = torch.where(off.abs() > tolerance, (left / 0.8).clamp(0.0, 1.0), 1.0)  # beside the axis: slowly
+        cruise = torch.where(run_up > 0.0, CRUISE, (speed + left.clamp(min=0.0)).clamp(max=CRUISE))
+        pace = torch.where(passing, speed, SLOW + (cruise - SLOW) * calm * late)
+        sideways = -SIDEWAYS * off * ((error.abs() < 2 * ALIGNED) & ~weaving)
+        turn = STEERING * error + torch.where(weaving, bend * pace, 0.0)
+        return td.set(keys.ACTION, self._decision(skill, pace, sideways, turn))
+
+    @staticmethod
+    def _around_poles(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Heading [rad] that follows the arc about the nearest pole, and the arc's curvature [1/m], left positive."""
+        pole = ((x / POLE_SPACING + 1.5).round().clamp(0, 3) - 1.5) * POLE_SPACING
+        side = torch.where((pole / POLE_SPACING + 1.5).round() % 2 == 0, -1.0, 1.0)
+        along, across = x - pole, side * y + BEND - SWAY
+        miss = torch.hypot(along, across) - BEND
+        tangent = -torch.atan2(along, across)
+        return side * (tangent - torch.atan(2.0 * miss)), -side / BEND
+
+    @staticmethod
+    def _decision(skill: Tensor, speed: Tensor, sideways: Tensor, turn: Tensor) -> TensorDict:
+        low, high = behaviours.command_bounds(skill.device)
+        parameters = torch.zeros(len(skill), behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS, device=skill.device)
+        for index, value in enumerate((speed, sideways, turn)):
+            span = (high - low)[:, index]
+            parameters[..., index] = (2.0 * (value[:, None] - low[:, index]) / span - 1.0).clamp(-1.0, 1.0)
+        return TensorDict({keys.BEHAVIOUR: skill, keys.PARAMETERS: parameters}, [len(skill)])
