@@ -1,4 +1,4 @@
-"""What lies in the way of robots that follow commands: bars before those that canter or jump, ramps before the others."""
+"""What lies in the way of robots that follow commands: bars where they canter or jump, ramps before the others."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Encounters:
         self._place(mask, simulator, commands)
 
     def advance(self, simulator: Simulator, commands: CommandSampler) -> None:
-        """After a control step: what lies behind, or before another command, is placed anew; nothing moves under a robot."""
+        """After a control step: what lies behind, or before another command, goes elsewhere, but not from under a robot."""
         along, across = self._local(simulator.root_position[:, :2]).unbind(-1)
         reach = self._reach[self.kind]
         at_it = (along.abs() < reach) & (across.abs() < HALF_WIDTH + 0.5)
@@ -94,7 +94,7 @@ class Encounters:
         self._place(~at_it & (behind | (commands.age == 0)), simulator, commands)
 
     def ground(self, position: Tensor) -> Tensor:
-        """Height [m] of the ramps above the ground under horizontal positions ``[N, 2]``, as ``[N]``; bars have none."""
+        """Height [m] of ramps above the ground under horizontal positions ``[N, 2]``, as ``[N]``; bars have none."""
         along, across = self._local(position).unbind(-1)
         on = (self.kind == RAMP) & (across.abs() <= HALF_WIDTH)
         return torch.where(on, ramp_height(along), 0.0)

@@ -82,7 +82,7 @@ def test_as_often_as_told(simulator: Simulator) -> None:
     for one in (ahead, never):
         one.begin(EVERYONE, simulator, told("jump"))
     assert 15 <= int((ahead.kind == BAR).sum()) <= 45 and not bool(never.kind.any())
-    with pytest.raises(ValueError, match="expected a share from 0 to 1, got 1.5"):
+    with pytest.raises(ValueError, match=r"expected a share from 0 to 1, got 1\.5"):
         encounters(1.5)
 
 
@@ -155,6 +155,6 @@ def test_robots_stand_on_ramps(simulator: Simulator) -> None:
 
 def test_a_simulator_without_them_is_refused() -> None:
     simulator = make_simulator(num_simulations=2, num_threads=1)
-    with pytest.raises(ValueError, match="must hold agility_rl.envs.encounters.PIECES"):
+    with pytest.raises(ValueError, match=r"must hold agility_rl\.envs\.encounters\.PIECES"):
         LocomotionEnv(2, simulator=simulator, encounters=0.5)
     simulator.close()
