@@ -86,7 +86,7 @@ class Encounters:
         self._place(mask, simulator, commands)
 
     def advance(self, simulator: Simulator, commands: CommandSampler) -> None:
-        """After a control step: what lies behind, or before another command, goes elsewhere, but not from under a robot."""
+        """After a control step: what lies behind, or before another command, moves, but not from under a robot."""
         along, across = self._local(simulator.root_position[:, :2]).unbind(-1)
         reach = self._reach[self.kind]
         at_it = (along.abs() < reach) & (across.abs() < HALF_WIDTH + 0.5)
