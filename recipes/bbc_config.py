@@ -112,8 +112,10 @@ class PPOConfig:
     """What is saved is a moving average of the controller's weights with this decay an iteration, so that less hangs on
     which iteration was the last; 0: the last weights. Ours (docs/bbc.md, The rhythm)."""
     symmetry: float = 0.0
-    """Weight of acting in a mirror as the mirror image does (squared distance of the mean actions), of behaviours that
-    are not ``--motion.one-sided`` (ours). Without it a controller turns better to one side."""
+    """Weight of acting in a mirror as the mirror image does (squared distance of the mean actions; ours): without it a
+    controller turns better to one side."""
+    symmetric: tuple[str, ...] = ("walk", "pace", "trot")
+    """Behaviours that are held to that. Gaits with a leading leg are not: between one and its image lies another."""
     initial_std: float = 1.0
     min_std: float = 0.1
     hidden: tuple[int, ...] = (512, 256, 128)

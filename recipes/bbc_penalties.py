@@ -33,7 +33,7 @@ def distance_to_anchor(parts: Components, sample: TensorDictBase, turn_rate: flo
     return error.mean()
 
 
-def asymmetry(parts: Components, sample: TensorDictBase, exempt: Tensor) -> Tensor:
+def asymmetry(parts: Components, sample: TensorDictBase, symmetric: Tensor) -> Tensor:
     """Mean squared difference between the mean actions before a mirror and in it [action units squared].
 
     Source: Yu, Turk and Liu 2018, arXiv:1801.08093, equation (3).
@@ -41,10 +41,9 @@ def asymmetry(parts: Components, sample: TensorDictBase, exempt: Tensor) -> Tens
     Args:
         parts: whose policy it is.
         sample: observations and ``skill``.
-        exempt: bool ``[5]``, behaviours with a leading leg: between such a gait and its image lies another gait.
+        symmetric: bool ``[5]``, behaviours that count; the others add nothing to the mean.
     """
     policy = parts.bbc.trained_actor()[:-1]
     seen = sample.select(*policy.in_keys)
     here, there = policy(seen.clone(recurse=False))["loc"], policy(mirror(seen))["loc"]
-    counts = ~exempt[sample[keys.SKILL]]
-    return ((mirror_joints(here) - there).square().mean(-1) * counts).mean()
+    return ((mirror_joints(here) - there).square().mean(-1) * symmetric[sample[keys.SKILL]]).mean()

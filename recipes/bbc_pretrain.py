@@ -227,7 +227,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
             infer(parts.bbc.history_encoder, batch)
         if parts.anchor is not None:
             hold(parts, batch)
-        one_sided = torch.tensor([name in cfg.motion.one_sided for name in BEHAVIOURS], device=batch.device)
+        symmetric = torch.tensor([name in cfg.ppo.symmetric for name in BEHAVIOURS], device=batch.device)
         kept = cfg.imitation.cloning_weight
         kept -= functional.linear_ramp(iteration, *cfg.imitation.cloning_fade, kept)
 
@@ -239,7 +239,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
                 away = distance_to_anchor(parts, sample, cfg.imitation.anchor_turn_rate)
                 loss = loss + cfg.imitation.anchor * away
             if cfg.ppo.symmetry:
-                loss = loss + cfg.ppo.symmetry * asymmetry(parts, sample, one_sided)
+                loss = loss + cfg.ppo.symmetry * asymmetry(parts, sample, symmetric)
             return loss
 
         metrics |= parts.ppo(batch, parts.generator, extra, critic_only=iteration < cfg.ppo.critic_warm_up)

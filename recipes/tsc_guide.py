@@ -39,14 +39,12 @@ class Passage:
     beside: float = 0.0
 
 
-SWAY = 0.36
-"""Distance at which poles are passed [m]."""
-BEND = (SWAY**2 + (POLE_SPACING / 2) ** 2) / (2.0 * SWAY)
-"""Radius of the arcs around them [m]: one begins where the other ends, on the line of the poles."""
+SWAY = 0.6
+"""Distance beside a pole that it heads for [m]; it comes to about half of that, for it heads for the next one early."""
 PASSAGES: dict[str, Passage] = {
     "bar_jump": Passage(-0.5, "canter", 1.6, 0.3, 0.9),
     "a_frame": Passage(-1.5, speed=1.1),
-    "weave_poles": Passage(-1.5, speed=0.6, beside=SWAY),
+    "weave_poles": Passage(-1.5, speed=0.5, beside=0.4),
     "seesaw": Passage(-1.5, speed=0.9),
     "tire_jump": Passage(-0.5, "canter", 1.6, 0.15, 0.9),
     "tunnel": Passage(-1.1, speed=0.9),
@@ -58,8 +56,11 @@ CRUISE, SLOW = 1.2, 0.5
 """Speed between obstacles, and in turns [m/s]."""
 LOOK_AHEAD, LEAST_LOOK_AHEAD = 0.9, 0.35
 """Distance of the point on the axis that it heads for [m], far from the obstacle and close to it."""
-BESIDE, ROOM = 0.5, 0.6
-"""Who is farther aside heads for a point so far before the obstacle [m]: there is room to turn."""
+BESIDE, MISSED, ROOM = 0.5, 0.3, 0.7
+"""Who is farther beside the axis, or farther beyond a way-point before the obstacle, heads for that, at least so far
+before the obstacle [m]."""
+FORESIGHT = 0.3
+"""So far before a pole it heads for the next [m], since a robot turns late."""
 STEERING = 2.5
 """Turn rate that is commanded for each radian of heading error [1/s]."""
 SIDEWAYS = 1.0
@@ -94,17 +95,19 @@ class Guide:
         """Decisions of ``N`` robots under ``action``."""
         kind, place = td[keys.OBSTACLE].argmax(-1), td[keys.PLACE]
         start, speed, tolerance, run_up, beside = self._figures.to(place.device)[kind].unbind(-1)
+        ahead, aside = place[:, :2].unbind(-1)  # of the way-point, in the robot's frame
         x, y, sine, cosine = place[:, 4:].unbind(-1)
+        goal_x = x + cosine * ahead - sine * aside
         heading, left = torch.atan2(sine, cosine), start - x  # ``left``: way that is left to come onto the axis
         line = torch.where(x > 0.0, beside, -beside)  # poles: begun on their right side, left on their left
         off = y - line
-        far = (off.abs() > BESIDE) & (x < torch.where(beside > 0.0, start, 0.0))
+        coming = goal_x < start + 0.1  # there is a way-point before the obstacle
+        far = coming & ((off.abs() > BESIDE) | (x > goal_x + MISSED))
         aim = x + (0.6 * left).clamp(LEAST_LOOK_AHEAD, LOOK_AHEAD)
-        aim = torch.where(far, torch.minimum(aim, start - ROOM), aim)
-        wanted = torch.atan2(-off, aim - x)
-        weaving = (beside > 0.0) & (x > start) & (x < -start)
-        around, bend = self._around_poles(x, y)
-        wanted = torch.where(weaving, around, wanted)
+        before = torch.minimum(goal_x, start - ROOM)
+        wanted = torch.where(far, torch.atan2(line - y, before - x), torch.atan2(-off, aim - x))
+        weaving = (beside > 0.0) & ~coming & (x < -start)
+        wanted = torch.where(weaving, self._to_next_pole(x, y), wanted)
         error = rotations.wrap_angle(wanted - heading)
         on_line = (off.abs() < tolerance) & (error.abs() < ALIGNED)
         passing = weaving | ((left < 0.0) & ~far) | ((left < run_up) & on_line)
@@ -114,18 +117,16 @@ class Guide:
         cruise = torch.where(run_up > 0.0, CRUISE, (speed + left.clamp(min=0.0)).clamp(max=CRUISE))
         pace = torch.where(passing, speed, SLOW + (cruise - SLOW) * calm * late)
         sideways = -SIDEWAYS * off * ((error.abs() < 2 * ALIGNED) & ~weaving)
-        turn = STEERING * error + torch.where(weaving, bend * pace, 0.0)
+        turn = STEERING * error
         return td.set(keys.ACTION, self._decision(skill, pace, sideways, turn))
 
     @staticmethod
-    def _around_poles(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Heading [rad] that follows the arc about the nearest pole, and the arc's curvature [1/m], left positive."""
-        pole = ((x / POLE_SPACING + 1.5).round().clamp(0, 3) - 1.5) * POLE_SPACING
-        side = torch.where((pole / POLE_SPACING + 1.5).round() % 2 == 0, -1.0, 1.0)
-        along, across = x - pole, side * y + BEND - SWAY
-        miss = torch.hypot(along, across) - BEND
-        tangent = -torch.atan2(along, across)
-        return side * (tangent - torch.atan(2.0 * miss)), -side / BEND
+    def _to_next_pole(x: Tensor, y: Tensor) -> Tensor:
+        """Heading [rad] to where the next pole is passed; the first on the right, the second on the left, and so on."""
+        following = ((x + FORESIGHT) / POLE_SPACING + 1.5).floor().add(1).clamp(0, 3)
+        side = torch.where(following % 2 == 0, -1.0, 1.0)
+        along = (following - 1.5) * POLE_SPACING - x
+        return torch.atan2(side * SWAY - y, along.clamp(min=LEAST_LOOK_AHEAD))
 
     @staticmethod
     def _decision(skill: Tensor, speed: Tensor, sideways: Tensor, turn: Tensor) -> TensorDict:

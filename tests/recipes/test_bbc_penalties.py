@@ -46,21 +46,21 @@ def test_asymmetry_is_what_the_mirror_image_does_otherwise(module: Module) -> No
     penalties, setup, presets = module("bbc_penalties"), module("bbc_setup"), module("bbc_presets")
     parts = setup.build(presets.SMOKE)
     batch = parts.rollout.collect(parts.bbc.privileged_policy()).flatten()[:64]
-    none = torch.zeros(5, dtype=torch.bool)
+    all_of_them = torch.ones(5, dtype=torch.bool)
     linear = [layer for layer in parts.bbc.actor.modules() if isinstance(layer, torch.nn.Linear)]
-    assert penalties.asymmetry(parts, batch, none) > 0.0
+    assert penalties.asymmetry(parts, batch, all_of_them) > 0.0
     with torch.no_grad():
         linear[-1].weight.zero_()  # the same action whatever it sees, alike on both sides
         linear[-1].bias.copy_(torch.tensor([0.1, 0.2, 0.3, -0.1, 0.2, 0.3] * 2))
-    assert penalties.asymmetry(parts, batch, none) == 0.0
+    assert penalties.asymmetry(parts, batch, all_of_them) == 0.0
     with torch.no_grad():
         linear[-1].bias[1] += 0.6  # one thigh of twelve joints: it and its image miss by 0.6 each
-    distance = penalties.asymmetry(parts, batch, none)
+    distance = penalties.asymmetry(parts, batch, all_of_them)
     torch.testing.assert_close(distance, torch.tensor(2 * 0.36 / 12))
-    walks = torch.tensor([True, False, False, False, False])
+    others = torch.tensor([False, True, True, True, True])
     share = (batch["skill"] != 0).float().mean()
     assert 0.0 < share < 1.0
-    torch.testing.assert_close(penalties.asymmetry(parts, batch, walks), distance * share)
+    torch.testing.assert_close(penalties.asymmetry(parts, batch, others), distance * share)
     distance.backward()
     gradient = linear[-1].bias.grad
     # 4 * 0.6 / 12 pulls the thigh that sticks out down, and its image up

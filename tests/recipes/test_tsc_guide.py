@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from agility_rl import keys
-from agility_rl.behaviours import command_bounds, commands_from_parameters, skill_index
+from agility_rl.behaviours import commands_from_parameters, skill_index
 from agility_rl.envs.mirror import mirror
 from agility_rl.envs.obstacles import OBSTACLES
 
@@ -19,10 +19,15 @@ Module = Callable[[str], ModuleType]
 KINDS = list(OBSTACLES)
 
 
-def standing(kind: str, *places: tuple[float, float, float]) -> TensorDict:
-    """Robots at local (x, y) [m] with headings [rad], before an obstacle."""
+def standing(kind: str, *places: tuple[float, float, float], goal: int | None = None) -> TensorDict:
+    """Robots at local (x, y) [m] with headings [rad], before an obstacle; its next way-point is theirs."""
     x, y, yaw = torch.tensor(places).unbind(-1)
-    place = torch.stack((*torch.zeros(4, len(places)), x, y, yaw.sin(), yaw.cos()), -1)
+    points = torch.tensor(OBSTACLES[kind].way_points)
+    following = (points[:, 0] < x[:, None] - 0.2).sum(-1).clamp(max=len(points) - 1)
+    goal_x, goal_y = points[following if goal is None else torch.full_like(following, goal)].unbind(-1)
+    ahead = yaw.cos() * (goal_x - x) + yaw.sin() * (goal_y - y)
+    aside = yaw.cos() * (goal_y - y) - yaw.sin() * (goal_x - x)
+    place = torch.stack((ahead, aside, *torch.zeros(2, len(places)), x, y, yaw.sin(), yaw.cos()), -1)
     obstacle = torch.eye(len(KINDS))[KINDS.index(kind)].expand(len(places), -1)
     return TensorDict({keys.PLACE: place, keys.OBSTACLE: obstacle}, [len(places)])
 
@@ -61,26 +66,30 @@ def test_it_decides_alike_in_a_mirror(module: Module, kind: str) -> None:
 
 def test_who_is_beside_the_axis_is_led_back_and_slows_down(module: Module) -> None:
     guide = module("tsc_guide")
-    left, right = (-2.0, 0.3, 0.0), (-2.0, -0.3, 0.0)
-    skill, command = commands(guide, standing("a_frame", left, right, (-1.6, 0.3, -0.9), (-2.9, 1.5, -1.5)))
-    assert skill.tolist() == [skill_index("trot")] * 4
-    low, high = (bound[skill_index("trot")] for bound in command_bounds())
-    assert low[2] <= command[0, 2] < 0.0 < command[1, 2] <= high[2]
-    assert command[2, 0] < 0.7 and command[0, 0] < guide.CRUISE
-    # 1.5 m aside and heading across: straight on towards (-2.1, 0), 0.49 rad further left than -1.5 - 0.41
-    bearing = math.atan2(-1.5, -2.1 + 2.9)
-    assert command[3, 2].item() == pytest.approx(guide.STEERING * (bearing + 1.5), abs=1e-4)
+    left, right = (-1.9, 0.15, 0.0), (-1.9, -0.15, 0.0)
+    skill, command = commands(guide, standing("a_frame", left, right))
+    assert skill.tolist() == [skill_index("trot")] * 2
+    assert command[0, 2] < 0.0 < command[1, 2] and command[1, 1] > 0.0 > command[0, 1]
+    assert command[0, 0] < guide.CRUISE
+    straight = commands(guide, standing("a_frame", (-1.9, 0.0, 0.0)))[1]
+    assert command[0, 0] < straight[0, 0]
 
 
-def test_poles_are_passed_on_arcs_that_join(module: Module) -> None:
+def test_who_is_far_aside_or_has_missed_it_goes_to_where_there_is_room(module: Module) -> None:
     guide = module("tsc_guide")
-    radius = guide.BEND
-    # On the arc about the second pole, at its top and where it meets its neighbours (slope: sine 0.5 / radius).
-    slope = math.asin(0.5 / radius)
-    td = standing("weave_poles", (-0.5, guide.SWAY, 0.0), (-0.999, 0.001, slope), (-0.001, 0.001, -slope))
-    skill, command = commands(guide, td)
+    # 2 m beside the mouth of the tunnel, which begins at -1.1: to (-2.025, 0), the first way-point, in a straight line
+    bearing = math.atan2(-2.0, -2.025 + 1.0)
+    _, command = commands(guide, standing("tunnel", (-1.0, 2.0, bearing), (-1.0, 2.0, bearing + 0.2), goal=0))
+    torch.testing.assert_close(command[:, 2], torch.tensor([0.0, -0.2 * guide.STEERING]), atol=1e-4, rtol=0.0)
+    # straight before the mouth, but the way-point behind it was not reached: back, as slowly as it may
+    _, command = commands(guide, standing("tunnel", (-1.1, 0.1, 0.0), goal=0))
+    assert command[0, 0].item() == pytest.approx(guide.SLOW) and abs(command[0, 2].item()) == pytest.approx(1.57)
+
+
+def test_poles_are_passed_on_alternating_sides(module: Module) -> None:
+    guide = module("tsc_guide")
+    skill, command = commands(guide, standing("weave_poles", (-1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
     assert skill.tolist() == [skill_index("trot")] * 3
-    turn = -command[:, 0] / radius  # to the right, as fast as the arc bends
-    torch.testing.assert_close(command[:, 2], turn, atol=0.02, rtol=0.0)
-    _, beyond = commands(guide, standing("weave_poles", (0.001, -0.001, -slope)))  # on the next arc, to the left
-    torch.testing.assert_close(beyond[:, 2], -turn[2:], atol=0.02, rtol=0.0)
+    turn = torch.tensor([1.0, -1.0, 1.0]) * min(guide.STEERING * math.atan2(guide.SWAY, 0.5), 1.57)
+    torch.testing.assert_close(command[:, 2], turn, atol=1e-3, rtol=0.0)
+    assert (command[:, 0] - guide.SLOW).abs().max() < 1e-5 and not bool(command[:, 1].abs().gt(1e-6).any())
