@@ -9,6 +9,8 @@ from typing import Literal
 
 from hardware import HardwareConfig
 
+from agility_rl.behaviours import RESAMPLE_PERIOD
+from agility_rl.motion.stride_patterns import FREQUENCY_GROWTH
 from agility_rl.training.precision import Precision
 
 
@@ -70,10 +72,14 @@ class EnvConfig:
     """Weight of a reward for going sideways as fast as commanded, and no faster, that has a slope everywhere (ours)."""
     rhythm_weight: float = 0.0
     """Weight of a reward for the stride frequency and the foot phases of the behaviour's labelled clips (ours)."""
+    walk_growth: float = FREQUENCY_GROWTH["walk"]
+    """Strides that a second shall hold more of for each m/s that the walk is commanded faster [1/m]."""
     collision_weight: float = -10.0
     """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
     episode_length: float = 20.0
     """Seconds until an episode is cut; shorter ones start more often in the middle of a dog's motion."""
+    resample_period: float = RESAMPLE_PERIOD
+    """Seconds between two commands (supplement S2: six); who is led over a course changes more often."""
     standing_starts: float = 0.0
     """Share of episodes that start from a stand instead of the middle of a dog's motion, as a course does."""
     end_when_sitting: bool = False

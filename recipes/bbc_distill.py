@@ -234,6 +234,7 @@ def main(cfg: Config) -> Path:
     known = first.artifact.manifest
     manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=env.dt, data=known["data"])
     manifest |= {name: known[name] for name in ("network", "prior") if name in known}
+    manifest["simulation"] = {"friction_loss": first.friction_loss}  # whatever --env says
     manifest["teachers"] = {
         name: teacher.artifact.manifest["weights"]["sha256"] for name, teacher in zip(BEHAVIOURS, teachers, strict=True)
     }

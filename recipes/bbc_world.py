@@ -45,6 +45,9 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
     if cfg.env.simulator is not None:
         simulator = load_simulator(cfg.env.simulator)
         randomization, model = simulator.randomization, model | dict(simulator.model)
+    patterns = None
+    if cfg.env.rhythm_weight:
+        patterns = stride_patterns(dataset.labelled_clips, {"walk": cfg.env.walk_growth})
     return LocomotionEnv(
         cfg.env.num_robots,
         simulator_options={**simulator_options(cfg, cfg.env.num_threads), **model, "terrain": terrain},
@@ -55,7 +58,8 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
         observation_noise=cfg.env.observation_noise,
         push_interval=cfg.env.push_interval,
         episode_length=cfg.env.episode_length,
-        patterns=stride_patterns(dataset.labelled_clips) if cfg.env.rhythm_weight else None,
+        resample_period=cfg.env.resample_period,
+        patterns=patterns,
         encounters=cfg.env.encounters,
         motion_offsets=cfg.motion.offsets,
         seed=seeds.integer("environment"),

@@ -99,8 +99,9 @@ def load_controller(path: Path) -> Controller:
     artifact.fill(bbc)
     file = run / "config.json"
     trained = json.loads(file.read_text(encoding="utf-8"))["config"] if file.is_file() else {}
-    told = artifact.manifest.get("simulation", {}).get("friction_loss", 0.0)
-    return Controller(bbc, artifact, trained, run, trained.get("env", {}).get("friction_loss", told))
+    configured = trained.get("env", {}).get("friction_loss", 0.0)
+    friction_loss = artifact.manifest.get("simulation", {}).get("friction_loss", configured)
+    return Controller(bbc, artifact, trained, run, friction_loss)
 
 
 def load_motion(config: MotionConfig, trained: Mapping[str, Any], seed: int) -> Motion:

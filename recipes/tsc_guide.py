@@ -16,6 +16,7 @@ from agility_rl import behaviours, keys, rotations
 from agility_rl.behaviours import skill_index
 from agility_rl.envs.decisions import NUM_PARAMETERS
 from agility_rl.envs.obstacles import OBSTACLES, POLE_SPACING
+from agility_rl.go2 import features
 
 
 @dataclass(frozen=True)
@@ -32,26 +33,30 @@ class Passage:
     """
 
     start: float
-    behaviour: str = "trot"
+    behaviour: str = "pace"
     speed: float = 1.0
     tolerance: float = 0.12
     run_up: float = 0.0
     beside: float = 0.0
 
 
-SWAY = 0.6
+SWAY = 0.7
 """Distance beside a pole that it heads for [m]; it comes to about half of that, for it heads for the next one early."""
 PASSAGES: dict[str, Passage] = {
-    "bar_jump": Passage(-0.5, "canter", 1.6, 0.3, 0.9),
+    "bar_jump": Passage(-0.5, "canter", 1.6, 0.3, 1.6),
     "a_frame": Passage(-1.5, speed=1.1),
-    "weave_poles": Passage(-1.5, speed=0.5, beside=0.4),
+    "weave_poles": Passage(-1.5, "trot", 0.5, beside=0.4),
     "seesaw": Passage(-1.5, speed=0.9),
-    "tire_jump": Passage(-0.5, "canter", 1.6, 0.15, 0.9),
+    "tire_jump": Passage(-0.5, "canter", 1.6, 0.15, 1.6),
     "tunnel": Passage(-1.1, speed=0.9),
     "box_jump": Passage(-0.8, "jump", 1.4, 0.4, 0.6),
 }
-USUAL = "trot"
+USUAL = "pace"
 """Behaviour between obstacles."""
+SLOWING, FAST = "canter", 1.35
+"""Behaviour in which it slows down from more than this speed [m/s] after a hurdle."""
+FORWARD = 1
+"""Of ``keys.EXPLICIT``: height, then velocities."""
 CRUISE, SLOW = 1.2, 0.5
 """Speed between obstacles, and in turns [m/s]."""
 LOOK_AHEAD, LEAST_LOOK_AHEAD = 0.9, 0.35
@@ -59,8 +64,10 @@ LOOK_AHEAD, LEAST_LOOK_AHEAD = 0.9, 0.35
 BESIDE, MISSED, ROOM = 0.5, 0.3, 0.7
 """Who is farther beside the axis, or farther beyond a way-point before the obstacle, heads for that, at least so far
 before the obstacle [m]."""
-FORESIGHT = 0.3
+FORESIGHT = 0.2
 """So far before a pole it heads for the next [m], since a robot turns late."""
+CLEAR, PAST = 0.34, 0.1
+"""Its middle stays so far beside a pole [m] until it is so far past it [m]."""
 STEERING = 2.5
 """Turn rate that is commanded for each radian of heading error [1/s]."""
 SIDEWAYS = 1.0
@@ -112,6 +119,8 @@ class Guide:
         on_line = (off.abs() < tolerance) & (error.abs() < ALIGNED)
         passing = weaving | ((left < 0.0) & ~far) | ((left < run_up) & on_line)
         skill = torch.where(passing, self._skill.to(place.device)[kind], skill_index(USUAL))
+        forward = td[keys.EXPLICIT][:, FORWARD] / features.LINEAR_VELOCITY_SCALE
+        skill = torch.where(~passing & (forward > FAST), skill_index(SLOWING), skill)
         calm = torch.exp(-((error.abs() - ALIGNED).clamp(min=0.0) / 0.4).square())
         late = torch.where(off.abs() > tolerance, (left / 0.8).clamp(0.0, 1.0), 1.0)  # beside the axis: slowly
         cruise = torch.where(run_up > 0.0, CRUISE, (speed + left.clamp(min=0.0)).clamp(max=CRUISE))
@@ -123,10 +132,14 @@ class Guide:
     @staticmethod
     def _to_next_pole(x: Tensor, y: Tensor) -> Tensor:
         """Heading [rad] to where the next pole is passed; the first on the right, the second on the left, and so on."""
-        following = ((x + FORESIGHT) / POLE_SPACING + 1.5).floor().add(1).clamp(0, 3)
-        side = torch.where(following % 2 == 0, -1.0, 1.0)
+        place = x / POLE_SPACING + 1.5  # 0 beside the first pole, 1 beside the second
+        following, beside = (place + FORESIGHT).floor().add(1).clamp(0, 3), place.round().clamp(0, 3)
         along = (following - 1.5) * POLE_SPACING - x
-        return torch.atan2(side * SWAY - y, along.clamp(min=LEAST_LOOK_AHEAD))
+        wanted = torch.atan2(_side(following) * SWAY - y, along.clamp(min=LEAST_LOOK_AHEAD))
+        rest = (beside - 1.5) * POLE_SPACING + PAST - x
+        side = _side(beside)  # not across before the pole is behind
+        least = torch.atan2(side * CLEAR - y, rest.clamp(min=0.05))
+        return torch.where(rest > 0.0, side * torch.maximum(side * wanted, side * least), wanted)
 
     @staticmethod
     def _decision(skill: Tensor, speed: Tensor, sideways: Tensor, turn: Tensor) -> TensorDict:
@@ -136,3 +149,8 @@ class Guide:
             span = (high - low)[:, index]
             parameters[..., index] = (2.0 * (value[:, None] - low[:, index]) / span - 1.0).clamp(-1.0, 1.0)
         return TensorDict({keys.BEHAVIOUR: skill, keys.PARAMETERS: parameters}, [len(skill)])
+
+
+def _side(pole: Tensor) -> Tensor:
+    """1 where a pole is passed on the left, -1 on the right."""
+    return torch.where(pole % 2 == 0, -1.0, 1.0)

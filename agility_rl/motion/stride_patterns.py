@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDict
@@ -17,7 +17,7 @@ MIRRORED_PAIRS = ((0, True), (1, True), (3, False), (2, False), (5, False), (4, 
 """Which of :data:`~agility_rl.go2.constants.FOOT_PAIRS` each of them becomes in a mirror, and whether its feet change
 places."""
 
-FREQUENCY_GROWTH = {"walk": 1.5}
+FREQUENCY_GROWTH: Mapping[str, float] = {"walk": 1.5}
 """Strides that a second holds more of for each m/s faster [1/m]: commands of the walk reach from standing to four times
 the speed of its clips. Others keep the frequency of theirs.
 
@@ -37,7 +37,7 @@ def mirrored(cross: Tensor) -> Tensor:
     return torch.stack([cross[..., i].conj() if turned else cross[..., i] for i, turned in MIRRORED_PAIRS], -1)
 
 
-def stride_patterns(clips: Sequence[MotionClip]) -> TensorDict:
+def stride_patterns(clips: Sequence[MotionClip], growth: Mapping[str, float] = FREQUENCY_GROWTH) -> TensorDict:
     """Stride frequency and phases between the feet of every behaviour, means of its labelled clips.
 
     A gait with a leading leg and its mirror image are one pattern: each clip counts as that of its two images which is
@@ -48,6 +48,7 @@ def stride_patterns(clips: Sequence[MotionClip]) -> TensorDict:
 
     Args:
         clips: with labels.
+        growth: strides that a second holds more of for each m/s faster [1/m], by behaviour; 0 where it does not say.
 
     Returns:
         ``[5]`` in the order of :data:`~agility_rl.behaviours.BEHAVIOURS`: ``frequency`` [Hz] at ``speed`` [m/s] and
@@ -79,9 +80,9 @@ def stride_patterns(clips: Sequence[MotionClip]) -> TensorDict:
             total = total + torch.where(nearer, image, cross)
         crosses.append(total)
     whole, (frequency, speed, share, duty) = torch.stack(crosses), torch.stack(figures, 1)
-    growth = torch.tensor([FREQUENCY_GROWTH.get(name, 0.0) for name in BEHAVIOURS])
+    quickening = torch.tensor([growth.get(name, 0.0) for name in BEHAVIOURS])
     phases = {"phase": whole.angle() / (2 * torch.pi), "mirrored_phase": mirrored(whole).angle() / (2 * torch.pi)}
-    pace = {"frequency": frequency, "speed": speed, "growth": growth, "duty": duty, "share": share}
+    pace = {"frequency": frequency, "speed": speed, "growth": quickening, "duty": duty, "share": share}
     return TensorDict({**pace, **phases}, [len(BEHAVIOURS)])
 
 

@@ -51,8 +51,10 @@ def test_the_share_of_a_sine_is_that_of_least_squares() -> None:
 
 
 def test_faster_walks_hurry() -> None:
-    patterns = stride_patterns([synthesize_gait(name) for name in BEHAVIOURS])
+    clips = [synthesize_gait(name) for name in BEHAVIOURS]
+    patterns = stride_patterns(clips)
     assert patterns["growth"].tolist() == [FREQUENCY_GROWTH["walk"], 0.0, 0.0, 0.0, 0.0]
+    assert stride_patterns(clips, {"pace": 0.5})["growth"].tolist() == [0.0, 0.5, 0.0, 0.0, 0.0]
 
 
 def test_a_mirrored_clip_has_the_mirrored_pattern() -> None:

@@ -77,6 +77,7 @@ def test_the_student_comes_nearer_to_its_teachers(
     assert told[0]["walk"] == 0.0 and told[0]["trot"] > 0.1, "the student starts as its first teacher"
     assert told[-1]["trot"] < 0.8 * told[0]["trot"]
     artifact = Artifact.load(run / "policy", kind="bbc")
+    assert artifact.manifest["simulation"] == {"friction_loss": 0.0}, "the teachers', whatever --env says"
     sums = {path: Artifact.load(path / "policy").manifest["weights"]["sha256"] for path in pair}
     assert (
         artifact.manifest["teachers"]["trot"] == sums[second] and artifact.manifest["teachers"]["pace"] == sums[first]

@@ -148,12 +148,14 @@ def test_the_prior_is_compared_with_shares_of_time(evaluate: ModuleType) -> None
 
 
 def test_a_controller_is_driven_with_the_friction_that_it_was_trained_with(tmp_path: Path, module) -> None:
-    """By its run's options; without them, by its manifest."""
+    """By its manifest; where that does not say, by its run's options."""
     load, bbc = module("rollouts").load_controller, BasicBehaviourController(hidden=(16, 16))
     manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=0.02)
     for name, told in (("plain", {}), ("told", {"simulation": {"friction_loss": 0.2}})):
         Artifact.save(tmp_path / name, bbc.state_dict(), manifest | {"network": bbc.settings} | told)
     assert [load(tmp_path / name).friction_loss for name in ("plain", "told")] == [0.0, 0.2]
-    Artifact.save(tmp_path / "run" / "policy", bbc.state_dict(), manifest | {"network": bbc.settings} | told)
-    (tmp_path / "run" / "config.json").write_text(json.dumps({"config": {"env": {"friction_loss": 0.1}}}))
-    assert load(tmp_path / "run").friction_loss == 0.1
+    options = json.dumps({"config": {"env": {"friction_loss": 0.1}}})  # of a distilled one: not what its teachers had
+    for name, said in (("silent", {}), ("distilled", told)):
+        Artifact.save(tmp_path / name / "policy", bbc.state_dict(), manifest | {"network": bbc.settings} | said)
+        (tmp_path / name / "config.json").write_text(options)
+    assert [load(tmp_path / name).friction_loss for name in ("silent", "distilled")] == [0.1, 0.2]
