@@ -16,7 +16,6 @@ from agility_rl import behaviours, keys, rotations
 from agility_rl.behaviours import skill_index
 from agility_rl.envs.decisions import NUM_PARAMETERS
 from agility_rl.envs.obstacles import OBSTACLES, POLE_SPACING
-from agility_rl.go2 import features
 
 
 @dataclass(frozen=True)
@@ -51,13 +50,9 @@ PASSAGES: dict[str, Passage] = {
     "tunnel": Passage(-1.1, speed=0.9),
     "box_jump": Passage(-0.8, "jump", 1.4, 0.4, 0.6),
 }
-USUAL = "pace"
+USUAL = "trot"
 """Behaviour between obstacles."""
-SLOWING, FAST = "canter", 1.35
-"""Behaviour in which it slows down from more than this speed [m/s] after a hurdle."""
-FORWARD = 1
-"""Of ``keys.EXPLICIT``: height, then velocities."""
-CRUISE, SLOW = 1.2, 0.5
+CRUISE, SLOW = 1.0, 0.5
 """Speed between obstacles, and in turns [m/s]."""
 LOOK_AHEAD, LEAST_LOOK_AHEAD = 0.9, 0.35
 """Distance of the point on the axis that it heads for [m], far from the obstacle and close to it."""
@@ -119,8 +114,6 @@ class Guide:
         on_line = (off.abs() < tolerance) & (error.abs() < ALIGNED)
         passing = weaving | ((left < 0.0) & ~far) | ((left < run_up) & on_line)
         skill = torch.where(passing, self._skill.to(place.device)[kind], skill_index(USUAL))
-        forward = td[keys.EXPLICIT][:, FORWARD] / features.LINEAR_VELOCITY_SCALE
-        skill = torch.where(~passing & (forward > FAST), skill_index(SLOWING), skill)
         calm = torch.exp(-((error.abs() - ALIGNED).clamp(min=0.0) / 0.4).square())
         late = torch.where(off.abs() > tolerance, (left / 0.8).clamp(0.0, 1.0), 1.0)  # beside the axis: slowly
         cruise = torch.where(run_up > 0.0, CRUISE, (speed + left.clamp(min=0.0)).clamp(max=CRUISE))

@@ -45,7 +45,7 @@ def test_on_its_line_it_goes_straight_ahead(module: Module, kind: str) -> None:
     guide = module("tsc_guide")
     passage = guide.PASSAGES[kind]
     skill, command = commands(
-        guide, standing(kind, (-2.9, -passage.beside, 0.0), (passage.start, -passage.beside, 0.0))
+        guide, standing(kind, (-2.9, -passage.beside, 0.0), (passage.start + 0.1, -passage.beside, 0.0))
     )
     torch.testing.assert_close(command[:, 1:3], torch.zeros(2, 2), atol=1e-5, rtol=0.0)
     assert skill.tolist() == [skill_index("trot"), skill_index(passage.behaviour)]
