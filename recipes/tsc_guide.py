@@ -47,7 +47,7 @@ PASSAGES: dict[str, Passage] = {
     "weave_poles": Passage(-1.5, "trot", 0.5, beside=0.4),
     "seesaw": Passage(-1.5, speed=0.9),
     "tire_jump": Passage(-0.5, "canter", 1.6, 0.15, 1.6),
-    "tunnel": Passage(-1.1, speed=0.9),
+    "tunnel": Passage(-1.1, "trot", 0.7, run_up=0.3),
     "box_jump": Passage(-0.8, "jump", 1.4, 0.4, 0.6),
 }
 USUAL = "trot"
