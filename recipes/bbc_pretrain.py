@@ -227,7 +227,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
             infer(parts.bbc.history_encoder, batch)
         if parts.anchor is not None:
             hold(parts, batch)
-        symmetric = torch.tensor([name in cfg.ppo.symmetric for name in BEHAVIOURS], device=batch.device)
+        symmetric = torch.tensor([name in cfg.ppo.symmetric for name in BEHAVIOURS], device=parts.env.device)
         kept = cfg.imitation.cloning_weight
         kept -= functional.linear_ramp(iteration, *cfg.imitation.cloning_fade, kept)
 
