@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from agility_rl import rotations
 from agility_rl.behaviours import COMMANDS, NUM_BEHAVIOURS, skill_index
 from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.obstacles import RAMP_LENGTH, bar_shape, ramp_height, ramp_shapes
@@ -64,7 +65,7 @@ class Encounters:
         >>> simulator = make_simulator(num_simulations=2, num_threads=1, scenery=PIECES)
         >>> encounters = Encounters(2, torch.Generator(), share=1.0)
         >>> commands = CommandSampler(2, torch.Generator(), None)  # both walk straight on
-        >>> encounters.begin(torch.ones(2, dtype=torch.bool), simulator, commands)
+        >>> encounters.place(torch.ones(2, dtype=torch.bool), simulator, commands)
         >>> encounters.kind.tolist()
         [2, 2]
     """
@@ -81,9 +82,33 @@ class Encounters:
         self.position, self.yaw = torch.zeros(n, 2, device=device), torch.zeros(n, device=device)
         self.lift = torch.zeros(n, device=device)
 
-    def begin(self, mask: Tensor, simulator: Simulator, commands: CommandSampler) -> None:
-        """Place before the rows of a bool mask ``[N]``, whose episodes begin."""
-        self._place(mask, simulator, commands)
+    def place(self, mask: Tensor, simulator: Simulator, commands: CommandSampler) -> None:
+        """Put something before the robots of the rows of a bool mask ``[N]``, where they stand and head for now."""
+        if not bool(mask.any()):
+            return
+        n, device = len(mask), mask.device
+        there, far, aside, turned, high = torch.rand(5, n, generator=self.generator, device=device)
+        straight = commands.command[:, COMMANDS.index("yaw_rate")].abs() <= STRAIGHT
+        leaping = self._leaping[commands.skill]
+        kind = torch.where(leaping, BAR, torch.where(straight, RAMP, NOTHING))
+        kind = torch.where(there < self.share, kind, NOTHING)
+        _, _, heading = rotations.to_euler(simulator.root_quaternion)
+        bearing = heading + BEARING * (2.0 * aside - 1.0)
+        distance = DISTANCE[0] + (DISTANCE[1] - DISTANCE[0]) * far + RAMP_LENGTH * (kind == RAMP)
+        way = torch.stack((bearing.cos(), bearing.sin()), -1)
+        # New tensors, because a state of an earlier step may still refer to the old ones.
+        self.kind = torch.where(mask, kind, self.kind)
+        self.position = torch.where(
+            mask[:, None], simulator.root_position[:, :2] + distance[:, None] * way, self.position
+        )
+        self.yaw = torch.where(mask, bearing + YAW * (2.0 * turned - 1.0), self.yaw)
+        self.lift = torch.where(mask, LIFT[0] + (LIFT[1] - LIFT[0]) * high, self.lift)
+        level = torch.zeros_like(self.yaw)
+        quaternion = rotations.from_euler(level, level, self.yaw)[:, None].expand(-1, len(PIECES), -1)
+        bar = torch.where(self.kind == BAR, self.lift, PARKED_DEPTH)
+        height = torch.stack((bar, torch.where(self.kind == RAMP, 0.0, PARKED_DEPTH)), -1)
+        position = torch.cat((self.position[:, None].expand(-1, len(PIECES), -1), height[..., None]), -1)
+        simulator.place(mask, position, quaternion, torch.zeros(n, 0, device=device))
 
     def advance(self, simulator: Simulator, commands: CommandSampler) -> None:
         """After a control step: what lies behind, or before another command, moves, but not from under a robot."""
@@ -91,7 +116,7 @@ class Encounters:
         reach = self._reach[self.kind]
         at_it = (along.abs() < reach) & (across.abs() < HALF_WIDTH + 0.5)
         behind = (self.kind != NOTHING) & ((along >= reach) | (along.square() + across.square() > ASTRAY**2))
-        self._place(~at_it & (behind | (commands.age == 0)), simulator, commands)
+        self.place(~at_it & (behind | (commands.age == 0)), simulator, commands)
 
     def ground(self, position: Tensor) -> Tensor:
         """Height [m] of ramps above the ground under horizontal positions ``[N, 2]``, as ``[N]``; bars have none."""
@@ -103,34 +128,6 @@ class Encounters:
         x, y = (position - self.position).unbind(-1)
         cosine, sine = self.yaw.cos(), self.yaw.sin()
         return torch.stack((cosine * x + sine * y, cosine * y - sine * x), -1)
-
-    def _place(self, mask: Tensor, simulator: Simulator, commands: CommandSampler) -> None:
-        if not bool(mask.any()):
-            return
-        n, device = len(mask), mask.device
-        there, far, aside, turned, high = torch.rand(5, n, generator=self.generator, device=device)
-        straight = commands.command[:, COMMANDS.index("yaw_rate")].abs() <= STRAIGHT
-        leaping = self._leaping[commands.skill]
-        kind = torch.where(leaping, BAR, torch.where(straight, RAMP, NOTHING))
-        kind = torch.where(there < self.share, kind, NOTHING)
-        w, x, y, z = simulator.root_quaternion.unbind(-1)
-        heading = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        bearing = heading + BEARING * (2.0 * aside - 1.0)
-        distance = DISTANCE[0] + (DISTANCE[1] - DISTANCE[0]) * far + RAMP_LENGTH * (kind == RAMP)
-        way = torch.stack((bearing.cos(), bearing.sin()), -1)
-        # New tensors, because a state of an earlier step may still refer to the old ones.
-        self.kind = torch.where(mask, kind, self.kind)
-        self.position = torch.where(
-            mask[:, None], simulator.root_position[:, :2] + distance[:, None] * way, self.position
-        )
-        self.yaw = torch.where(mask, bearing + YAW * (2.0 * turned - 1.0), self.yaw)
-        self.lift = torch.where(mask, LIFT[0] + (LIFT[1] - LIFT[0]) * high, self.lift)
-        half, zero = self.yaw / 2.0, torch.zeros_like(self.yaw)
-        quaternion = torch.stack((half.cos(), zero, zero, half.sin()), -1)[:, None].expand(-1, len(PIECES), -1)
-        bar = torch.where(self.kind == BAR, self.lift, PARKED_DEPTH)
-        height = torch.stack((bar, torch.where(self.kind == RAMP, 0.0, PARKED_DEPTH)), -1)
-        position = torch.cat((self.position[:, None].expand(-1, len(PIECES), -1), height[..., None]), -1)
-        simulator.place(mask, position, quaternion, torch.zeros(n, 0, device=device))
 
     def state_dict(self) -> dict[str, Any]:
         """What lies where; the simulator holds it too."""

@@ -66,8 +66,8 @@ class LocomotionEnv(EnvBase):
         seed: seed of all randomness in the environment.
 
     Raises:
-        ValueError: if the simulator holds another number of robots or not what lies in the way, a reference entry is
-            missing or too short, a behaviour has no reference state, or the offsets do not rise from zero.
+        ValueError: if the simulator holds another number of robots or, with encounters, another world, a reference
+            entry is missing or too short, a behaviour has no reference state, or the offsets do not rise from zero.
 
     Example:
         >>> env = LocomotionEnv(2, simulator_options={"num_threads": 1})
@@ -97,18 +97,15 @@ class LocomotionEnv(EnvBase):
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
         seed: int = 0,
     ) -> None:
-        pieces = PIECES if encounters else ()
-        engine = {"scenery": pieces, **(simulator_options or {})}
+        engine = {"scenery": PIECES if encounters else (), **(simulator_options or {})}
         simulator = simulator or make_simulator(num_simulations=num_robots, **engine)
         super().__init__(device=simulator.device, batch_size=torch.Size([num_robots]))
         self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
         self.simulator, device = simulator, simulator.device
         if self.simulator.num_simulations != num_robots:
             raise ValueError(f"the simulator holds {self.simulator.num_simulations} robots, expected {num_robots}")
-        if tuple(self.simulator.scenery) != pieces:
-            raise ValueError(
-                "with encounters the simulator must hold agility_rl.envs.encounters.PIECES, else no scenery"
-            )
+        if encounters and (tuple(simulator.scenery) != PIECES or simulator.ground_extent > 0.0):
+            raise ValueError("encounters need a plane, and a simulator that holds agility_rl.envs.encounters.PIECES")
         self.dt = self.simulator.control_dt
         self.rewards = dict(rewards)
         self.terminations = tuple(terminations)
@@ -192,7 +189,7 @@ class LocomotionEnv(EnvBase):
             self.commands.resample(mask)
         past = self._place(mask)
         if self.encounters is not None:
-            self.encounters.begin(mask, self.simulator, self.commands)
+            self.encounters.place(mask, self.simulator, self.commands)
         if self.randomization is not None:
             self.robots.randomize(mask, self.randomization)
         self._step_count = self._step_count.masked_fill(mask, 0)

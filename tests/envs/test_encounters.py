@@ -16,7 +16,7 @@ from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.encounters import ASTRAY, BAR, DISTANCE, LIFT, NOTHING, PIECES, RAMP, Encounters
 from agility_rl.envs.obstacles import APEX_HEIGHT, RAMP_LENGTH
 from agility_rl.go2.constants import DEFAULT_POSE, STANDING_HEIGHT
-from agility_rl.simulation import Simulator, make_simulator
+from agility_rl.simulation import Piece, Shape, Simulator, make_simulator, ridges
 from agility_rl.simulation.scenery import PARKED_DEPTH
 
 N = 60
@@ -66,7 +66,7 @@ def test_it_lies_ahead_of_whom_it_is_for(simulator: Simulator, skill: str, yaw_r
     yaw = torch.linspace(-3.0, 3.0, N)
     stand(simulator, torch.randn(N, 2), yaw)
     ahead = encounters()
-    ahead.begin(EVERYONE, simulator, told(skill, yaw_rate))
+    ahead.place(EVERYONE, simulator, told(skill, yaw_rate))
     assert ahead.kind.unique().tolist() == [kind]
     offset = ahead.position - simulator.root_position[:, :2]
     bearing = rotations.wrap_angle(torch.atan2(offset[:, 1], offset[:, 0]) - yaw)
@@ -80,7 +80,7 @@ def test_as_often_as_told(simulator: Simulator) -> None:
     stand(simulator, torch.zeros(N, 2), torch.zeros(N))
     ahead, never = encounters(0.5), encounters(0.0)
     for one in (ahead, never):
-        one.begin(EVERYONE, simulator, told("jump"))
+        one.place(EVERYONE, simulator, told("jump"))
     assert 15 <= int((ahead.kind == BAR).sum()) <= 45 and not bool(never.kind.any())
     with pytest.raises(ValueError, match=r"expected a share from 0 to 1, got 1\.5"):
         encounters(1.5)
@@ -89,7 +89,7 @@ def test_as_often_as_told(simulator: Simulator) -> None:
 def test_nothing_moves_under_a_robot_and_what_lies_behind_comes_again(simulator: Simulator) -> None:
     stand(simulator, torch.zeros(N, 2), torch.zeros(N))
     ahead, commands = encounters(), told("trot")
-    ahead.begin(EVERYONE, simulator, commands)
+    ahead.place(EVERYONE, simulator, commands)
     before = ahead.position.clone()
     way = torch.stack((ahead.yaw.cos(), ahead.yaw.sin()), -1)
     commands.age[:] = 0  # another command for everyone
@@ -112,7 +112,7 @@ def test_nothing_moves_under_a_robot_and_what_lies_behind_comes_again(simulator:
 def test_another_command_brings_something_else(simulator: Simulator) -> None:
     stand(simulator, torch.zeros(N, 2), torch.zeros(N))
     ahead, walks, jumps = encounters(), told("walk"), told("jump")
-    ahead.begin(EVERYONE, simulator, walks)
+    ahead.place(EVERYONE, simulator, walks)
     ahead.advance(simulator, jumps)
     assert ahead.kind.unique().tolist() == [RAMP], "only with the command's first step"
     jumps.age[:] = 0
@@ -123,7 +123,7 @@ def test_another_command_brings_something_else(simulator: Simulator) -> None:
 def test_the_ground_is_where_rays_meet_it(simulator: Simulator) -> None:
     stand(simulator, torch.zeros(N, 2), torch.linspace(-3.0, 3.0, N))
     ahead = encounters()
-    ahead.begin(EVERYONE, simulator, told("walk"))
+    ahead.place(EVERYONE, simulator, told("walk"))
     data = mujoco.MjData(simulator.model)
     generator = torch.Generator().manual_seed(1)
     checked = 0
@@ -145,7 +145,7 @@ def test_the_ground_is_where_rays_meet_it(simulator: Simulator) -> None:
 def test_robots_stand_on_ramps(simulator: Simulator) -> None:
     stand(simulator, torch.zeros(N, 2), torch.zeros(N))
     ahead = encounters()
-    ahead.begin(EVERYONE, simulator, told("walk"))
+    ahead.place(EVERYONE, simulator, told("walk"))
     stand(simulator, ahead.position, ahead.yaw, APEX_HEIGHT)
     for _ in range(10):
         simulator.step(torch.tensor(DEFAULT_POSE).repeat(N, 1))
@@ -153,8 +153,13 @@ def test_robots_stand_on_ramps(simulator: Simulator) -> None:
     assert ahead.ground(simulator.root_position[:, :2]).min() > 0.8 * APEX_HEIGHT
 
 
-def test_a_simulator_without_them_is_refused() -> None:
-    simulator = make_simulator(num_simulations=2, num_threads=1)
-    with pytest.raises(ValueError, match=r"must hold agility_rl\.envs\.encounters\.PIECES"):
-        LocomotionEnv(2, simulator=simulator, encounters=0.5)
-    simulator.close()
+def test_another_world_is_refused_with_them_only() -> None:
+    field = ridges(torch.Generator().manual_seed(0), half_size=6.0)
+    step = Piece("step", (Shape("box", (0.5, 0.5, 0.1)),))
+    for world in ({"scenery": ()}, {"terrain": field}, {"scenery": (step,)}):
+        options = {"num_threads": 1, **world}
+        with pytest.raises(ValueError, match="encounters need a plane, and a simulator that holds"):
+            LocomotionEnv(2, simulator_options=options, encounters=0.5)
+        env = LocomotionEnv(2, simulator_options=options)
+        env.rollout(2)
+        env.close()
