@@ -9,7 +9,7 @@ from typing import Literal
 
 from hardware import HardwareConfig
 
-from agility_rl.behaviours import RESAMPLE_PERIOD
+from agility_rl.behaviours import BEHAVIOURS, RESAMPLE_PERIOD
 from agility_rl.motion.stride_patterns import FREQUENCY_GROWTH
 from agility_rl.training.precision import Precision
 
@@ -231,12 +231,14 @@ CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "sk
 """Options that may change during a run."""
 
 
-def check_changes(cfg: Config) -> None:
-    """Refuse changes of options that cannot change.
+def check(cfg: Config) -> None:
+    """Refuse changes of options that cannot change, and behaviours that do not exist.
 
     Raises:
-        ValueError: naming the option and those that can.
+        ValueError: naming the option and what can stand there.
     """
+    if unknown := sorted(set(cfg.ppo.symmetric) - set(BEHAVIOURS)):
+        raise ValueError(f"--ppo.symmetric: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
     for _, option, _ in cfg.changes:
         if option.replace("-", "_") not in CHANGEABLE:
             raise ValueError(f"--changes: {option} cannot change in a run, only {', '.join(CHANGEABLE)} can")

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import torch
 from bbc_cloning import clone_behaviour
-from bbc_config import Config, ImitationConfig, at, check_changes
+from bbc_config import Config, ImitationConfig, at, check
 from bbc_penalties import asymmetry, distance_to_anchor, hold
 from bbc_presets import PRESETS
 from bbc_setup import Components, build, save_policy
@@ -177,7 +177,7 @@ def begin(parts: Components, cfg: Config) -> None:
 def train(cfg: Config) -> Path:
     """Algorithm S1; returns the run folder."""
     cfg = own_options(cfg)
-    check_changes(cfg)
+    check(cfg)
     return run(
         "bbc_pretrain",
         cfg,

@@ -67,7 +67,8 @@ class LocomotionEnv(EnvBase):
 
     Raises:
         ValueError: if the simulator holds another number of robots or, with encounters, another world, a reference
-            entry is missing or too short, a behaviour has no reference state, or the offsets do not rise from zero.
+            entry is missing or too short, a behaviour has no reference state, the offsets do not rise from zero, or
+            commands shall be redrawn more often than at every control step.
 
     Example:
         >>> env = LocomotionEnv(2, simulator_options={"num_threads": 1})
@@ -113,6 +114,8 @@ class LocomotionEnv(EnvBase):
         self.max_steps = round(episode_length / self.dt)
         self.generator = torch.Generator(device).manual_seed(seed)
         period = None if resample_period is None else round(resample_period / self.dt)
+        if period is not None and period < 1:
+            raise ValueError(f"resample_period must be at least a control step, {self.dt} s, got {resample_period}")
         self.commands = CommandSampler(num_robots, self.generator, period)
         self.observations = ObservationGroups(num_robots, self.generator, observation_noise, motion_offsets)
         self.reference = (

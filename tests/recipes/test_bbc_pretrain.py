@@ -27,6 +27,7 @@ ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1"}
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 EVERYTHING = (
+    *("--env.encounters", "0.8", "--env.resample-period", "0.2", "--env.lateral-weight", "2", "--ppo.symmetry", "1"),
     *("--env.rhythm-weight", "1.0", "--env.randomize", "--env.push-interval", "0.1", "--env.observation-noise", "1"),
     *("--env.action-delay", "0.01", "--env.action-delay-from", "5", "--env.progress-fade", "2", "4"),
     *("--imitation.information-ramp", "2", "4", "--adaptation.privileged-ramp", "3", "2", "--adaptation.every", "3"),
@@ -177,12 +178,22 @@ def test_options_change_at_their_iterations(module: Callable[[str], ModuleType])
     assert [config.at(cfg, iteration).env.jump_weight for iteration in (2, 3)] == [6.0, 9.0]
 
 
-def test_what_cannot_change_in_a_run_is_refused(tmp_path: Path, command: Command) -> None:
-    options = ("--runs", tmp_path, "--name", "changing", "--changes", "3", "ppo.gamma", "0.5")
-    result = command("bbc_pretrain", "smoke", *options)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--changes", "3", "ppo.gamma", "0.5"), "ppo.gamma cannot change in a run, only ppo.entropy"),
+        (("--ppo.symmetric", "walk", "hop"), "--ppo.symmetric: unknown hop; expected some of walk, pace"),
+        (("--env.resample-period", "0"), "resample_period must be at least a control step, 0.02 s, got 0.0"),
+        (("--env.encounters", "1.5"), "encounters: expected a share from 0 to 1, got 1.5"),
+    ],
+)
+def test_impossible_options_are_refused(
+    tmp_path: Path, command: Command, options: tuple[str, ...], message: str
+) -> None:
+    result = command("bbc_pretrain", "smoke", "--runs", tmp_path, "--name", "odd", *options)
     assert result.returncode != 0 and "Traceback" not in result.stderr
-    assert "ppo.gamma cannot change in a run, only ppo.entropy" in result.stderr
-    assert not (tmp_path / "changing").exists()
+    assert message in result.stderr
+    assert not (tmp_path / "odd").exists()
 
 
 def test_a_gated_reward_is_paid_in_proportion_to_the_speed(module: Callable[[str], ModuleType]) -> None:
