@@ -8,6 +8,7 @@ Out: tables on the screen, ``RUN/course_evaluation.json``, ``RUN/figures/course_
     python recipes/evaluate_course.py runs/my_teacher --course targets   # full, each obstacle alone, box, hurdles
     python recipes/evaluate_course.py --script trot:1.2 --course each --episodes 50
     python recipes/evaluate_course.py --script trot:1.2,bar_jump=jump:1.4 --course bar_jump
+    python recipes/evaluate_course.py --script guide --bbc pretrained/bbc_guided --course each full
     python recipes/evaluate_course.py runs/my_student --disturbance all  # rectangles, noise, ..., a late camera
 
 Courses: a preset, a .toml or .json file, ``each`` for every obstacle of the challenge alone, or ``targets``.
@@ -62,7 +63,8 @@ class Config:
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run or artifact folder of a teacher or student."""
     script: str | None = None
-    """BEHAVIOUR:SPEED [m/s], such as trot:1.2, or trot:1.2,bar_jump=jump:1.4,... , in place of it."""
+    """BEHAVIOUR:SPEED [m/s], such as trot:1.2, or trot:1.2,bar_jump=jump:1.4,... , in place of it; or ``guide``, which
+    knows in metres where robots stand."""
     bbc: Path | None = None
     """Folder of the Basic Behaviour Controller: that of the training by default, for a script that of the teachers."""
     course: tuple[str, ...] = ()

@@ -94,7 +94,13 @@ class Guide:
         self._skill = torch.tensor([skill_index(p.behaviour) for p in passages])
 
     def decide(self, td: TensorDictBase) -> TensorDictBase:
-        """Decisions of ``N`` robots under ``action``."""
+        """Decisions of ``N`` robots under ``action``.
+
+        Source: ours; heading for a point ahead on a line is pure pursuit (Coulter 1992, CMU-RI-TR-92-01).
+
+        Args:
+            td: ``place`` [N, 8] [m] and ``obstacle`` [N, 7] (:mod:`agility_rl.keys`).
+        """
         kind, place = td[keys.OBSTACLE].argmax(-1), td[keys.PLACE]
         start, speed, tolerance, run_up, beside = self._figures.to(place.device)[kind].unbind(-1)
         ahead, aside = place[:, :2].unbind(-1)  # of the way-point, in the robot's frame
@@ -103,12 +109,12 @@ class Guide:
         heading, left = torch.atan2(sine, cosine), start - x  # ``left``: way that is left to come onto the axis
         line = torch.where(x > 0.0, beside, -beside)  # poles: begun on their right side, left on their left
         off = y - line
-        coming = goal_x < start + 0.1  # there is a way-point before the obstacle
+        coming = goal_x < start + 0.1  # the next way-point lies before the obstacle, not on it
         far = coming & ((off.abs() > BESIDE) | (x > goal_x + MISSED))
         aim = x + (0.6 * left).clamp(LEAST_LOOK_AHEAD, LOOK_AHEAD)
         before = torch.minimum(goal_x, start - ROOM)
         wanted = torch.where(far, torch.atan2(line - y, before - x), torch.atan2(-off, aim - x))
-        weaving = (beside > 0.0) & ~coming & (x < -start)
+        weaving = (beside > 0.0) & ~coming & (x < -start)  # the poles end where they began, mirrored
         wanted = torch.where(weaving, self._to_next_pole(x, y), wanted)
         error = rotations.wrap_angle(wanted - heading)
         on_line = (off.abs() < tolerance) & (error.abs() < ALIGNED)
@@ -117,10 +123,9 @@ class Guide:
         calm = torch.exp(-((error.abs() - ALIGNED).clamp(min=0.0) / 0.4).square())
         late = torch.where(off.abs() > tolerance, (left / 0.8).clamp(0.0, 1.0), 1.0)  # beside the axis: slowly
         cruise = torch.where(run_up > 0.0, CRUISE, (speed + left.clamp(min=0.0)).clamp(max=CRUISE))
-        pace = torch.where(passing, speed, SLOW + (cruise - SLOW) * calm * late)
+        forward = torch.where(passing, speed, SLOW + (cruise - SLOW) * calm * late)
         sideways = -SIDEWAYS * off * ((error.abs() < 2 * ALIGNED) & ~weaving)
-        turn = STEERING * error
-        return td.set(keys.ACTION, self._decision(skill, pace, sideways, turn))
+        return td.set(keys.ACTION, self._decision(skill, forward, sideways, STEERING * error))
 
     @staticmethod
     def _to_next_pole(x: Tensor, y: Tensor) -> Tensor:

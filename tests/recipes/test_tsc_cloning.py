@@ -61,6 +61,21 @@ def test_the_script_drives_its_share(module: Module, smoke: Any) -> None:
     parts.env.close()
 
 
+def test_the_guide_leads_by_where_robots_stand(module: Module, smoke: Any) -> None:
+    parts = module("tsc_setup").build(replace(smoke, place=True))
+    cloning = replace(smoke.cloning, script="guide", scripted=1.0)
+    losses = module("tsc_cloning").clone(parts, cloning)
+    assert all(math.isfinite(loss) for loss in losses.values())
+    decider = module("deciders").load_script("guide", smoke.bbc)
+    assert set(decider.behaviours) == {"pace", "trot", "canter", "jump"}
+    td = parts.env.reset()
+    led = module("tsc_cloning").led(parts, module("tsc_script").read("guide"), parts.env.num_robots)(td.clone())
+    told = decider.decide(td.clone())[keys.ACTION]
+    assert torch.equal(led[keys.ACTION, keys.BEHAVIOUR], told[keys.BEHAVIOUR])
+    assert torch.equal(led[keys.ACTION, keys.PARAMETERS], told[keys.PARAMETERS])
+    parts.env.close()
+
+
 def test_a_teacher_does_what_it_has_copied(module: Module, smoke: Any) -> None:
     parts = module("tsc_setup").build(replace(smoke, env=replace(smoke.env, num_robots=32)))
     own = replace(smoke.cloning, script="trot:1.4,tunnel=walk:0.4", iterations=10, epochs=20, learning_rate=3e-3)
