@@ -44,6 +44,6 @@ def asymmetry(parts: Components, sample: TensorDictBase, symmetric: Tensor) -> T
         symmetric: bool ``[5]``, behaviours that count; the others add nothing to the mean.
     """
     policy = parts.bbc.trained_actor()[:-1]
-    seen = sample.select(*policy.in_keys)
+    seen = sample.select(*policy.in_keys)[symmetric[sample[keys.SKILL]]]
     here, there = policy(seen.clone(recurse=False))["loc"], policy(mirror(seen))["loc"]
-    return ((mirror_joints(here) - there).square().mean(-1) * symmetric[sample[keys.SKILL]]).mean()
+    return (mirror_joints(here) - there).square().mean(-1).sum() / len(sample)
