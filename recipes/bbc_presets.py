@@ -20,7 +20,7 @@ PAPER = Config(
     ppo=PPOConfig(minibatches=4),
 )
 CPU = Config(
-    iterations=1000,
+    iterations=1100,
     max_minutes=58.0,
     changes=(
         (350, "ppo.entropy", 0.0005),
@@ -38,8 +38,10 @@ CPU = Config(
         episode_length=8.0,
         progress_weight=8.0,
         progress_fade=(120, 120),
-        progress_left=4.0,
+        progress_left=7.0,
         rhythm_weight=20.0,
+        walk_growth=1.0,
+        standing_starts=0.25,
         jump_weight=16.0,
         jump_width=0.03,
     ),
@@ -89,7 +91,9 @@ POLISH = replace(
     changes=(),
     motion=replace(CPU.motion, one_sided=("canter", "jump")),
     # No fading: it walks already. No rhythm: those that this preset was made for came without.
-    env=replace(CPU.env, progress_weight=4.0, rhythm_weight=0.0, jump_weight=20.0),
+    env=replace(
+        CPU.env, progress_weight=4.0, progress_left=4.0, rhythm_weight=0.0, jump_weight=20.0, standing_starts=0.0
+    ),
     ppo=replace(
         CPU.ppo,
         learning_rate=1e-4,
@@ -115,7 +119,7 @@ QUICKSTART = replace(
     name="quickstart",
     iterations=110,
     max_minutes=5.0,
-    env=replace(CPU.env, num_robots=512, rhythm_weight=0.0),
+    env=replace(CPU.env, num_robots=512, rhythm_weight=0.0, standing_starts=0.0),
     ppo=replace(CPU.ppo, averaging=0.0),  # 110 iterations of fast learning are too few to average over 25
     imitation=replace(CPU.imitation, cloning=500),
 )
