@@ -185,7 +185,7 @@ def applied(policy: TensorDictSequential) -> TensorDictSequential:
 
 
 def load_student(parts: Components, path: Path) -> None:
-    """Start from another run's student.
+    """Start from another run's student, but for the estimator, which is that of this run's controller.
 
     Raises:
         ArtifactError: if it is none, or has other sizes.
@@ -201,7 +201,8 @@ def load_student(parts: Components, path: Path) -> None:
             f"{trained.artifact.folder}: the student has {own}, this run builds {wanted}; give the same --memory, "
             "--encoder-hidden and --heading-gate, and a teacher of the same sizes"
         )
-    parts.student.load_state_dict(trained.network.state_dict())
+    own_estimator = {f"estimator.{name}": value for name, value in parts.student.estimator.state_dict().items()}
+    parts.student.load_state_dict(trained.network.state_dict() | own_estimator)
 
 
 def annealed(first: float, last: float, iteration: int, length: int) -> float:

@@ -120,6 +120,19 @@ def test_sixteen_bits_without_byol_from_another_student(recipe: ModuleType, smok
     assert "loss_byol" not in read_scalars(run) and "loss_behaviour" in read_scalars(run)
 
 
+def test_a_student_of_another_teacher_takes_this_ones_estimator(
+    recipe: ModuleType, smoke: Any, make_student: Callable[..., Path]
+) -> None:
+    """It is not learned, and belongs to the controller below."""
+    other = Artifact.load(make_student("other"))
+    state = {n: value + float(n.startswith(("estimator.", "memory."))) for n, value in other.state.items()}
+    Artifact.save(other.folder, state, other.manifest)
+    run = recipe.train(replace(smoke, name="child", init_from=other.folder, iterations=0))
+    began, teacher = Artifact.load(run / "policy").state, Artifact.load(smoke.teacher / "policy").state
+    assert all(torch.equal(began[n], (teacher if n.startswith("estimator.") else state)[n]) for n in state)
+    assert any(name.startswith("estimator.") for name in state)
+
+
 def test_labels_are_what_is_applied(module: Module, smoke: Any) -> None:
     """A teacher that says far more than the environment takes is copied in what it takes."""
     setup = module("tsc_student_setup")
