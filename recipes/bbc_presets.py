@@ -20,13 +20,17 @@ PAPER = Config(
     ppo=PPOConfig(minibatches=4),
 )
 CPU = Config(
-    iterations=1100,
+    iterations=1150,
     max_minutes=58.0,
     changes=(
         (350, "ppo.entropy", 0.0005),
         (500, "ppo.desired_kl", 0.008),
         (500, "imitation.imitation_reward", 6.0),
         (500, "env.jump_weight", 20.0),
+        (1000, "env.jump_weight", 28.0),
+        (1000, "env.progress_left", 7.0),
+        (1000, "env.standing_starts", 0.25),
+        (1000, "env.walk_memory", 1.2),
     ),
     motion=MotionConfig(one_sided=("canter",), offsets=(0, 8, 16, 23, 24), standing_weight=0.0),
     env=EnvConfig(
@@ -38,10 +42,9 @@ CPU = Config(
         episode_length=8.0,
         progress_weight=8.0,
         progress_fade=(120, 120),
-        progress_left=7.0,
+        progress_left=4.0,
         rhythm_weight=20.0,
-        walk_growth=1.0,
-        standing_starts=0.25,
+        walk_fewer=0.1,
         jump_weight=16.0,
         jump_width=0.03,
     ),
@@ -91,9 +94,7 @@ POLISH = replace(
     changes=(),
     motion=replace(CPU.motion, one_sided=("canter", "jump")),
     # No fading: it walks already. No rhythm: those that this preset was made for came without.
-    env=replace(
-        CPU.env, progress_weight=4.0, progress_left=4.0, rhythm_weight=0.0, jump_weight=20.0, standing_starts=0.0
-    ),
+    env=replace(CPU.env, progress_weight=4.0, rhythm_weight=0.0, jump_weight=20.0),
     ppo=replace(
         CPU.ppo,
         learning_rate=1e-4,
@@ -119,7 +120,7 @@ QUICKSTART = replace(
     name="quickstart",
     iterations=110,
     max_minutes=5.0,
-    env=replace(CPU.env, num_robots=512, rhythm_weight=0.0, standing_starts=0.0),
+    env=replace(CPU.env, num_robots=512, rhythm_weight=0.0),
     ppo=replace(CPU.ppo, averaging=0.0),  # 110 iterations of fast learning are too few to average over 25
     imitation=replace(CPU.imitation, cloning=500),
 )

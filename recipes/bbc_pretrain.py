@@ -202,6 +202,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         fading = cfg.env.progress_weight - cfg.env.progress_left
         faded = functional.linear_ramp(iteration, *cfg.env.progress_fade, fading)
         parts.env.rewards["velocity_progress"] = term._replace(weight=cfg.env.progress_weight - faded)
+    parts.env.standing_starts = cfg.env.standing_starts
+    if parts.env.rhythm is not None:
+        parts.env.rhythm.memory[BEHAVIOURS.index("walk")] = cfg.env.walk_memory
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     parts.env.set_skill_probabilities(parts.prior.sampling_probabilities)
     if parts.env.randomization is not None:

@@ -14,7 +14,6 @@ from tensordict import TensorDict
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.randomization import NOMINAL, Randomization
-from agility_rl.envs.reference import standing_states
 from agility_rl.envs.rewards import (
     LOCOMOTION_REWARDS,
     RewardTerm,
@@ -38,7 +37,7 @@ SHORTEST = 0.5
 
 def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv:
     """Robots that start in the middle of the dogs' motion."""
-    reference = starts(cfg, dataset, seeds.generator("reference"))
+    reference = starts(dataset, seeds.generator("reference"))
     terrain = make_terrain(cfg.env, torch.Generator().manual_seed(seeds.integer("terrain")))
     randomization = Randomization() if cfg.env.randomize else NOMINAL if cfg.env.action_delay else None
     model: dict[str, Any] = {"friction_loss": cfg.env.friction_loss}
@@ -48,10 +47,12 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
     patterns = None
     if cfg.env.rhythm_weight:
         patterns = stride_patterns(dataset.labelled_clips, {"walk": cfg.env.walk_growth})
+        patterns["frequency"][BEHAVIOURS.index("walk")] -= cfg.env.walk_fewer
     return LocomotionEnv(
         cfg.env.num_robots,
         simulator_options={**simulator_options(cfg, cfg.env.num_threads), **model, "terrain": terrain},
         reference=reference,
+        standing_starts=cfg.env.standing_starts,
         rewards=rewards(cfg.env),
         terminations=(*LOCOMOTION_TERMINATIONS, *([thigh_contact] if cfg.env.end_when_sitting else [])),
         randomization=randomization,
@@ -83,19 +84,10 @@ def rewards(cfg: EnvConfig) -> dict[str, RewardTerm]:
     return terms
 
 
-def starts(cfg: Config, dataset: MotionDataset, generator: torch.Generator, each: int = 2000) -> TensorDict:
-    """States to start an episode from, ``each`` of every behaviour: of dogs in motion, and standing ones.
-
-    Raises:
-        ValueError: if the share of standing ones is not between 0 and 1.
-    """
-    if not 0.0 <= cfg.env.standing_starts <= 1.0:
-        raise ValueError(f"--env.standing-starts: expected a share from 0 to 1, got {cfg.env.standing_starts}")
-    standing = round(each * cfg.env.standing_starts)
-    skills = torch.arange(len(BEHAVIOURS), device=generator.device)
-    moving = skills.repeat_interleave(each - standing)
-    states = dataset.sample_states(moving, generator).set("skill", moving)
-    return torch.cat((states, standing_states(skills.repeat_interleave(standing), cfg.motion.offsets[-1])))
+def starts(dataset: MotionDataset, generator: torch.Generator, each: int = 2000) -> TensorDict:
+    """States of dogs in motion to start an episode from, ``each`` of every behaviour."""
+    skills = torch.arange(len(BEHAVIOURS), device=generator.device).repeat_interleave(each)
+    return dataset.sample_states(skills, generator).set("skill", skills)
 
 
 def make_terrain(cfg: EnvConfig, generator: torch.Generator) -> HeightField | None:

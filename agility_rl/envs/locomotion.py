@@ -49,6 +49,7 @@ class LocomotionEnv(EnvBase):
         simulator_options: keyword arguments of :func:`agility_rl.simulation.make_simulator`.
         reference: states for reference-state initialisation as :class:`ReferenceStates` takes them; ``None`` starts
             from standing.
+        standing_starts: share of the episodes that start from standing all the same; may be set anew at any time.
         rewards: reward terms by name.
         terminations: failures; an episode ends when one of them holds.
         randomization: ranges of physical parameters, drawn anew at each reset; ``None`` leaves the model nominal.
@@ -85,6 +86,7 @@ class LocomotionEnv(EnvBase):
         simulator: Simulator | None = None,
         simulator_options: Mapping[str, Any] | None = None,
         reference: TensorDictBase | None = None,
+        standing_starts: float = 0.0,
         rewards: Mapping[str, RewardTerm] = LOCOMOTION_REWARDS,
         terminations: Sequence[Termination] = LOCOMOTION_TERMINATIONS,
         randomization: Randomization | None = None,
@@ -122,6 +124,7 @@ class LocomotionEnv(EnvBase):
             ReferenceStates.standing(device) if reference is None else ReferenceStates(reference.to(device))
         )
         self.reference.check_past(motion_offsets[-1])
+        self.standing_starts = standing_starts
         n = num_robots
         interval = None if push_interval is None else round(push_interval / self.dt)
         self.pushes = Pushes(n, self.generator, interval, push_velocity)
@@ -240,7 +243,7 @@ class LocomotionEnv(EnvBase):
     # -- physics -----------------------------------------------------------------------------------------------------
     def _place(self, mask: Tensor) -> Tensor | None:
         n = self.num_robots
-        number = self.reference.draw(self.commands.skill, self.generator)
+        number = self.reference.draw(self.commands.skill, self.generator, self.standing_starts)
         start, past = self.reference.states[number], self.reference.past_motion
         yaw = uniform((n,), (0.0, 2.0 * torch.pi), self.generator)
         turn = rotations.from_euler(torch.zeros_like(yaw), torch.zeros_like(yaw), yaw)

@@ -58,7 +58,7 @@ def standing_states(skill: Tensor, span: int = 0) -> TensorDict:
 
 
 class ReferenceStates:
-    """States of recorded motion, sorted by skill, from which resets are drawn.
+    """States of recorded motion, sorted by skill, from which resets are drawn, and for each skill one that stands.
 
     Source: method notes, section 4.2 (a random time of a random labelled clip of the drawn class).
 
@@ -68,8 +68,8 @@ class ReferenceStates:
             ``joint_velocity`` [M, 12]; optionally ``past_motion`` [M, span, 49], the discriminator frames before.
 
     Attributes:
-        states: ``[M]``, sorted, without the frames before.
-        past_motion: those, ``[M, span, 49]``, or ``None``.
+        states: ``[M + 5]``, sorted, the standing one the last of its skill, without the frames before.
+        past_motion: those, ``[M + 5, span, 49]``, or ``None``.
 
     Raises:
         ValueError: if an entry is missing or a behaviour has no state.
@@ -78,7 +78,7 @@ class ReferenceStates:
         >>> reference = ReferenceStates.standing()
         >>> number = reference.draw(torch.tensor([0, 4]), torch.Generator())
         >>> number.tolist(), reference.states[number]["joint_position"].shape
-        ([0, 4], torch.Size([2, 12]))
+        ([0, 8], torch.Size([2, 12]))
     """
 
     def __init__(self, states: TensorDictBase) -> None:
@@ -89,7 +89,11 @@ class ReferenceStates:
         empty = [name for name, number in zip(behaviours.BEHAVIOURS, self.count.tolist(), strict=True) if not number]
         if empty:
             raise ValueError(f"no reference state for {', '.join(empty)}; give at least one for each behaviour")
-        self.first = torch.cumsum(self.count, 0) - self.count
+        self.first = torch.cumsum(self.count + 1, 0) - self.count - 1
+        every = torch.arange(behaviours.NUM_BEHAVIOURS, device=states["skill"].device)
+        entries = ("skill", *STATE_ENTRIES, *([PAST] if PAST in states.keys() else []))  # noqa: SIM118
+        standing = standing_states(every, states[PAST].shape[1] if PAST in entries else 0)
+        states = torch.cat([some.select(*entries).to_tensordict() for some in (states, standing)])
         by_skill = torch.argsort(states["skill"], stable=True)
         self.states = states.select(*STATE_ENTRIES)[by_skill]
         past = states.get(PAST, None)
@@ -112,7 +116,8 @@ class ReferenceStates:
         """One state for all behaviours: standing in the default pose."""
         return cls(standing_states(torch.arange(behaviours.NUM_BEHAVIOURS, device=device)))
 
-    def draw(self, skill: Tensor, generator: torch.Generator) -> Tensor:
-        """The numbers int64 ``[N]`` of a random state of each given skill."""
-        fraction = torch.rand(skill.shape, generator=generator, device=skill.device)
-        return self.first[skill] + (fraction * self.count[skill]).long()
+    def draw(self, skill: Tensor, generator: torch.Generator, standing: float = 0.0) -> Tensor:
+        """The numbers int64 ``[N]`` of a random state of each given skill, of which a share is the standing one."""
+        fraction = torch.rand(skill.shape, generator=generator, device=skill.device) - standing
+        moving = (fraction / max(1.0 - standing, 1e-6) * self.count[skill]).long()
+        return self.first[skill] + torch.where(fraction < 0.0, self.count[skill], moving)

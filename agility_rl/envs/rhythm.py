@@ -15,9 +15,9 @@ from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants
 from agility_rl.go2.features import in_stance
 
-MEMORY: Mapping[str, float] = dict.fromkeys(BEHAVIOURS, 0.6) | {"walk": 1.2}
-"""Strides after which what a foot did counts 1/e: less blurs the phase and forgives a wrong stride frequency, more is
-slow to hear a beginner. The walk swings in purer sines than a dog's: with 0.6 it hurries by 0.2 Hz for nothing."""
+MEMORY = 0.6
+"""Strides after which what a foot did counts 1/e: less blurs the phase and forgives a wrong stride frequency, more does
+not hear how a beginner comes nearer."""
 REST = 0.006
 """Fore-aft motion [m] beside which a standing robot's trembling is no stride, but a step on the spot is."""
 STANCE_MEMORY = 2.0
@@ -59,6 +59,9 @@ class Rhythm:
             ``duty`` :math:`d^*`, ``share`` s, ``phase`` and ``mirrored_phase`` [5, 6] [strides], as
             :func:`agility_rl.motion.stride_patterns.stride_patterns` makes them; where it is, the tensors are.
 
+    Attributes:
+        memory: m of each behaviour, ``[5]``, :data:`MEMORY` until somebody says otherwise.
+
     Example:
         >>> from tensordict import TensorDict
         >>> pattern = {name: torch.ones(5) for name in ("frequency", "speed", "growth", "share")}
@@ -75,7 +78,7 @@ class Rhythm:
     def __init__(self, num_robots: int, patterns: TensorDictBase) -> None:
         device = patterns["frequency"].device
         self._figures = torch.stack([patterns[name] for name in _FIGURES], -1)  # [5, 5]
-        self._memory = torch.tensor([MEMORY[name] for name in BEHAVIOURS], device=device)[:, None]
+        self.memory = torch.full((len(BEHAVIOURS),), MEMORY, device=device)
         self._images = torch.stack([patterns[name] for name in ("phase", "mirrored_phase")], 1)  # [5, 2, 6]
         self._swing = torch.zeros(num_robots, 4, dtype=torch.complex64, device=device)
         self._power, self._mean = (torch.zeros(num_robots, 4, device=device) for _ in range(2))
@@ -109,7 +112,7 @@ class Rhythm:
         now, usually = forward[..., None]
         standing = in_stance((position - last) / dt + now, usually).float().mean(-1)
         self._stance = stance + (standing - stance) * step[:, 0] / STANCE_MEMORY
-        decay = step / self._memory[skill]
+        decay = step / self.memory[skill, None]
         self._mean = mean + (position - mean) * decay / 2.5
         aside = position - self._mean
         turn = torch.polar(torch.exp(-decay), 2.0 * math.pi * step)

@@ -65,6 +65,18 @@ def test_draws_follow_the_generator() -> None:
     assert torch.equal(one, other)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_a_share_of_the_draws_stands(share: float) -> None:
+    """One state of each skill does; of the others each is drawn as often."""
+    reference = ReferenceStates(states([0, 1, 2, 3, 4] * 3))
+    skill = torch.full((4000,), 2)
+    number = reference.draw(skill, torch.Generator().manual_seed(0), share) - reference.first[2]
+    moving = [(1.0 - share) / 3] * 3
+    assert torch.bincount(number, minlength=4).div(4000).tolist() == pytest.approx([*moving, share], abs=0.03)
+    stands = reference.states[reference.first + reference.count]
+    assert (stands["joint_position"] == torch.tensor(DEFAULT_POSE)).all()
+
+
 def test_standing_states_stand() -> None:
     state = ReferenceStates.standing().states
     assert state["joint_position"].unique(dim=0).tolist() == torch.tensor([DEFAULT_POSE]).tolist()

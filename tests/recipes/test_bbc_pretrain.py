@@ -31,7 +31,8 @@ EVERYTHING = (
     *("--env.rhythm-weight", "1.0", "--env.randomize", "--env.push-interval", "0.1", "--env.observation-noise", "1"),
     *("--env.action-delay", "0.01", "--env.action-delay-from", "5", "--env.progress-fade", "2", "4"),
     *("--imitation.information-ramp", "2", "4", "--adaptation.privileged-ramp", "3", "2", "--adaptation.every", "3"),
-    *("--changes", "5", "ppo.entropy", "0.002", "6", "env.jump-weight", "9.0"),
+    *("--changes", "5", "ppo.entropy", "0.002", "6", "env.jump-weight", "9.0", "3", "env.standing-starts", "0.5"),
+    *("5", "env.walk-memory", "1.2", "6", "env.progress-left", "7.0"),
 )
 """Whatever is random, and ramps and changes on both sides of the middle of eight iterations."""
 
@@ -184,6 +185,11 @@ def test_options_change_at_their_iterations(module: Callable[[str], ModuleType])
         (("--changes", "3", "ppo.gamma", "0.5"), "ppo.gamma cannot change in a run, only ppo.entropy"),
         (("--ppo.symmetric", "walk", "hop"), "--ppo.symmetric: unknown hop; expected some of walk, pace"),
         (("--env.resample-period", "0"), "resample_period must be at least a control step, 0.02 s, got 0.0"),
+        (("--env.standing-starts", "2"), "--env.standing-starts: expected a share from 0 to 1, got 2.0"),
+        (
+            ("--changes", "3", "env.standing-starts", "-1"),
+            "--env.standing-starts: expected a share from 0 to 1",
+        ),
         (("--env.encounters", "1.5"), "encounters: expected a share from 0 to 1, got 1.5"),
     ],
 )

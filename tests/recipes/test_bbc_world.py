@@ -10,26 +10,9 @@ import pytest
 import torch
 
 from agility_rl.behaviours import BEHAVIOURS
-from agility_rl.go2.constants import DEFAULT_POSE
 from agility_rl.motion import synthesize_gait
 
 Module = Callable[[str], ModuleType]
-
-
-def test_a_share_of_the_starts_stands(module: Module) -> None:
-    world, smoke = module("bbc_world"), module("bbc_presets").SMOKE
-    dataset = world.load_dataset(smoke.motion, 0)
-    shares = {}
-    for share in (0.0, 0.25, 1.0):
-        cfg = replace(smoke, env=replace(smoke.env, standing_starts=share))
-        starts = world.starts(cfg, dataset, torch.Generator().manual_seed(0), each=40)
-        assert torch.bincount(starts["skill"]).tolist() == [40] * 5
-        assert starts["past_motion"].shape == (200, smoke.motion.offsets[-1], 49)
-        stands = (starts["joint_position"] == torch.tensor(DEFAULT_POSE)).all(-1)
-        shares[share] = torch.bincount(starts["skill"][stands], minlength=5).tolist()
-    assert shares == {0.0: [0] * 5, 0.25: [10] * 5, 1.0: [40] * 5}
-    with pytest.raises(ValueError, match=r"--env.standing-starts: expected a share from 0 to 1, got 2.0"):
-        world.starts(replace(smoke, env=replace(smoke.env, standing_starts=2.0)), dataset, torch.Generator())
 
 
 def test_only_rewards_with_a_weight_are_paid(module: Module) -> None:
