@@ -74,8 +74,6 @@ class EnvConfig:
     """Weight of a reward for the stride frequency and the foot phases of the behaviour's labelled clips (ours)."""
     walk_growth: float = FREQUENCY_GROWTH["walk"]
     """Strides that a second shall hold more of for each m/s that the walk is commanded faster [1/m]."""
-    walk_fewer: float = 0.0
-    """Strides a second fewer than the dogs' that the walk is asked for: it takes more than it is asked for (ours)."""
     walk_memory: float = 0.6
     """Strides after which what a walking foot did counts 1/e. With 0.6, 0.2 strides a second too many cost nothing,
     since robots swing in purer sines than dogs; with more, a beginner does not hear how he comes nearer (ours)."""

@@ -44,7 +44,7 @@ CPU = Config(
         progress_fade=(120, 120),
         progress_left=4.0,
         rhythm_weight=20.0,
-        walk_fewer=0.1,
+        walk_growth=1.0,
         jump_weight=16.0,
         jump_width=0.03,
     ),

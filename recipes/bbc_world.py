@@ -47,7 +47,6 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
     patterns = None
     if cfg.env.rhythm_weight:
         patterns = stride_patterns(dataset.labelled_clips, {"walk": cfg.env.walk_growth})
-        patterns["frequency"][BEHAVIOURS.index("walk")] -= cfg.env.walk_fewer
     return LocomotionEnv(
         cfg.env.num_robots,
         simulator_options={**simulator_options(cfg, cfg.env.num_threads), **model, "terrain": terrain},
