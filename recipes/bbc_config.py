@@ -243,7 +243,10 @@ def check(cfg: Config) -> None:
     """
     if unknown := sorted(set(cfg.ppo.symmetric) - set(BEHAVIOURS)):
         raise ValueError(f"--ppo.symmetric: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
-    shares = [cfg.env.standing_starts, *(v for _, option, v in cfg.changes if option == "env.standing_starts")]
+    shares = [
+        cfg.env.standing_starts,
+        *(v for _, option, v in cfg.changes if option.replace("-", "_") == "env.standing_starts"),
+    ]
     if bad := [share for share in shares if not 0.0 <= share <= 1.0]:
         raise ValueError(f"--env.standing-starts: expected a share from 0 to 1, got {bad[0]}")
     for _, option, _ in cfg.changes:

@@ -12,7 +12,7 @@ from agility_rl import keys
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.observations import ObservationGroups, RecentFrames
-from agility_rl.envs.reference import ReferenceStates
+from agility_rl.envs.reference import standing_states
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import features
 
@@ -143,7 +143,7 @@ def test_motion_frames_far_apart(build: Build) -> None:
 
 
 def test_before_an_episode_stand_the_frames_of_the_reference(build: Build) -> None:
-    reference = ReferenceStates.standing().states.clone()
+    reference = standing_states(torch.arange(5))
     reference["skill"] = torch.arange(5)
     reference["past_motion"] = torch.arange(5.0)[:, None, None].expand(5, 3, 49) + torch.tensor([[0.1], [0.2], [0.3]])
     env = build(4, reference=reference, motion_offsets=(0, 1, 3))
