@@ -76,7 +76,7 @@ class EnvConfig:
     """Strides that a second shall hold more of for each m/s that the walk is commanded faster [1/m]."""
     walk_memory: float = 0.6
     """Strides after which what a walking foot did counts 1/e. With 0.6, 0.2 strides a second too many cost nothing,
-    since robots swing in purer sines than dogs; with more, a beginner does not hear how he comes nearer (ours)."""
+    since robots swing in purer sines than dogs; more pays a beginner nothing for coming nearer (ours)."""
     collision_weight: float = -10.0
     """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
     episode_length: float = 20.0

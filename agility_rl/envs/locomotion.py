@@ -68,7 +68,8 @@ class LocomotionEnv(EnvBase):
 
     Raises:
         ValueError: if the simulator holds another number of robots or, with encounters, another world, a reference
-            entry is missing or too short, a behaviour has no reference state, the offsets do not rise from zero, or
+            entry is missing or too short, a behaviour has no reference state, ``standing_starts`` is no share, the
+            offsets do not rise from zero, or
             commands shall be redrawn more often than at every control step.
 
     Example:
@@ -124,6 +125,8 @@ class LocomotionEnv(EnvBase):
             ReferenceStates.standing(device) if reference is None else ReferenceStates(reference.to(device))
         )
         self.reference.check_past(motion_offsets[-1])
+        if not 0.0 <= standing_starts <= 1.0:
+            raise ValueError(f"standing_starts: expected a share from 0 to 1, got {standing_starts}")
         self.standing_starts = standing_starts
         n = num_robots
         interval = None if push_interval is None else round(push_interval / self.dt)

@@ -70,6 +70,8 @@ class ReferenceStates:
     Attributes:
         states: ``[M + 5]``, sorted, the standing one the last of its skill, without the frames before.
         past_motion: those, ``[M + 5, span, 49]``, or ``None``.
+        first: number of each skill's first state, int64 ``[5]``.
+        count: how many of them move, int64 ``[5]``; the standing one comes after.
 
     Raises:
         ValueError: if an entry is missing or a behaviour has no state.
@@ -117,7 +119,8 @@ class ReferenceStates:
         return cls(standing_states(torch.arange(behaviours.NUM_BEHAVIOURS, device=device)))
 
     def draw(self, skill: Tensor, generator: torch.Generator, standing: float = 0.0) -> Tensor:
-        """The numbers int64 ``[N]`` of a random state of each given skill, of which a share is the standing one."""
+        """The numbers int64 ``[N]`` of a random state of each given skill ``[N]``, by chance its standing one, for a
+        share ``standing`` of them, 0 to 1."""
         fraction = torch.rand(skill.shape, generator=generator, device=skill.device) - standing
         moving = (fraction / max(1.0 - standing, 1e-6) * self.count[skill]).long()
         return self.first[skill] + torch.where(fraction < 0.0, self.count[skill], moving)

@@ -16,8 +16,8 @@ from agility_rl.go2 import constants
 from agility_rl.go2.features import in_stance
 
 MEMORY = 0.6
-"""Strides after which what a foot did counts 1/e: less blurs the phase and forgives a wrong stride frequency, more does
-not hear how a beginner comes nearer."""
+"""Strides after which what a foot did counts 1/e: less blurs the phase and forgives a wrong stride frequency, more
+pays nothing for coming nearer from far off."""
 REST = 0.006
 """Fore-aft motion [m] beside which a standing robot's trembling is no stride, but a step on the spot is."""
 STANCE_MEMORY = 2.0
@@ -41,9 +41,8 @@ class Rhythm:
 
     with a memory of m strides (:data:`MEMORY`), beside the mean square :math:`p_i` over the same time; :math:`d` is
     the share of the last two strides in which a foot stood (:func:`~agility_rl.go2.features.in_stance`). The share of
-    the motion that has the frequency,
-    beside the dogs' own share s, times the agreements of the duty factor and of the phases with the pattern's or its
-    mirror image's, is
+    the motion that has the frequency, beside the dogs' own share s, times the agreements of the duty factor and of the
+    phases with the pattern's or its mirror image's, is
 
     .. math:: \min\left(1, \frac{1}{s} \frac{2 \sum |z_i|^2}{\sum p_i + 4 \cdot 0.006^2}\right)
               \exp\left(-\frac{(d - d^*)^2}{0.15^2}\right)
@@ -60,7 +59,7 @@ class Rhythm:
             :func:`agility_rl.motion.stride_patterns.stride_patterns` makes them; where it is, the tensors are.
 
     Attributes:
-        memory: m of each behaviour, ``[5]``, :data:`MEMORY` until somebody says otherwise.
+        memory: m of each behaviour [strides], ``[5]``; :data:`MEMORY` unless set.
 
     Example:
         >>> from tensordict import TensorDict

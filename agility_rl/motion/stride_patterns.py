@@ -62,9 +62,8 @@ def stride_patterns(clips: Sequence[MotionClip], growth: Mapping[str, float] = F
         ``[5]`` in the order of :data:`~agility_rl.behaviours.BEHAVIOURS`: ``frequency`` [Hz] at ``speed`` [m/s] and
         how it grows with that, ``growth`` [1/m]; ``duty``, the share of time in which a foot shall stand
         (:data:`LONGER_STANCE`); ``share``, how much of the mean square of the feet's motion a sine of that frequency
-        is; ``phase`` and ``mirrored_phase``
-        ``[5, 6]`` [strides], in the order of :data:`~agility_rl.go2.constants.FOOT_PAIRS`, how far the first foot is
-        ahead of the second.
+        is; ``phase`` and ``mirrored_phase`` ``[5, 6]`` [strides], in the order of
+        :data:`~agility_rl.go2.constants.FOOT_PAIRS`, how far the first foot is ahead of the second.
 
     Raises:
         MotionError: if a behaviour has no clip.

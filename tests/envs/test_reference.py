@@ -77,6 +77,17 @@ def test_a_share_of_the_draws_stands(share: float) -> None:
     assert (stands["joint_position"] == torch.tensor(DEFAULT_POSE)).all()
 
 
+def test_an_environment_starts_from_a_stand_as_often_as_told(build: Callable[..., LocomotionEnv]) -> None:
+    env, pose = build(40, reference=states([0, 1, 2, 3, 4]), standing_starts=1.0), torch.tensor(DEFAULT_POSE)
+    env.reset()
+    torch.testing.assert_close(env.simulator.joint_position, pose.expand(40, 12))
+    env.standing_starts = 0.0
+    env.reset()
+    assert ((env.simulator.joint_position - pose).abs().amax(-1) > 0.01).all()
+    with pytest.raises(ValueError, match=r"standing_starts: expected a share from 0 to 1, got 1\.5"):
+        build(2, standing_starts=1.5)
+
+
 def test_standing_states_stand() -> None:
     state = ReferenceStates.standing().states
     assert state["joint_position"].unique(dim=0).tolist() == torch.tensor([DEFAULT_POSE]).tolist()
