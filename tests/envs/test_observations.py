@@ -144,7 +144,6 @@ def test_motion_frames_far_apart(build: Build) -> None:
 
 def test_before_an_episode_stand_the_frames_of_the_reference(build: Build) -> None:
     reference = standing_states(torch.arange(5))
-    reference["skill"] = torch.arange(5)
     reference["past_motion"] = torch.arange(5.0)[:, None, None].expand(5, 3, 49) + torch.tensor([[0.1], [0.2], [0.3]])
     env = build(4, reference=reference, motion_offsets=(0, 1, 3))
     carrier = env.reset()

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from agility_rl import keys
 from agility_rl.behaviours import NUM_BEHAVIOURS
 from agility_rl.envs import LocomotionEnv
-from agility_rl.envs.reference import STATE_ENTRIES, standing_states
+from agility_rl.envs.reference import standing_states
 from agility_rl.envs.state import LocomotionState
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, body_contact, diverged, thigh_contact
 
@@ -41,10 +41,10 @@ def test_divergence(neutral: Neutral) -> None:
 
 
 def upside_down() -> TensorDict:
-    standing = standing_states(torch.arange(5)).select(*STATE_ENTRIES)
+    standing = standing_states(torch.arange(NUM_BEHAVIOURS))
     standing["root_quaternion"][:] = torch.tensor([0.0, 1.0, 0.0, 0.0])
     standing["root_height"][:] = 0.3
-    return standing.set("skill", torch.arange(NUM_BEHAVIOURS))
+    return standing
 
 
 def test_robots_dropped_on_their_backs_terminate_by_contact(build: Build) -> None:
