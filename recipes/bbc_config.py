@@ -207,6 +207,21 @@ class AdaptationConfig:
 
 
 @dataclass(frozen=True)
+class TrialsConfig:
+    start: int | None = None
+    """Iteration after which the controller is first measured as ``evaluate.py`` does; what the run shows is then the
+    best one that was, not the last. Never when not given. Ours (docs/bbc.md, The last steps)."""
+    every: int = 25
+    """Iterations between two trials, of which one takes about as long as ten iterations."""
+    episodes: int = 100
+    """Episodes of each behaviour."""
+    seconds: float = 20.0
+    """Length of an episode."""
+    switches: int = 10
+    """Trials of each of the 20 ordered switches between behaviours."""
+
+
+@dataclass(frozen=True)
 class Config(HardwareConfig):
     name: str = "bbc"
     """Folder under ``runs``."""
@@ -227,6 +242,7 @@ class Config(HardwareConfig):
     ppo: PPOConfig = field(default_factory=PPOConfig)
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     adaptation: AdaptationConfig = field(default_factory=AdaptationConfig)
+    trials: TrialsConfig = field(default_factory=TrialsConfig)
 
 
 CHANGEABLE: tuple[str, ...] = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight", "env.progress_left")
@@ -236,7 +252,7 @@ CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "sk
 
 
 def check(cfg: Config) -> None:
-    """Refuse changes of options that cannot change, and behaviours that do not exist.
+    """Refuse changes of options that cannot change, behaviours that do not exist, and trials that measure nothing.
 
     Raises:
         ValueError: naming the option and what can stand there.
@@ -249,6 +265,9 @@ def check(cfg: Config) -> None:
     ]
     if bad := [share for share in shares if not 0.0 <= share <= 1.0]:
         raise ValueError(f"--env.standing-starts: expected a share from 0 to 1, got {bad[0]}")
+    for name, least in (("start", 1), ("every", 1), ("episodes", 1), ("seconds", 2), ("switches", 0)):
+        if (value := getattr(cfg.trials, name)) is not None and value < least:
+            raise ValueError(f"--trials.{name}: expected at least {least}, got {value}")
     for _, option, _ in cfg.changes:
         if option.replace("-", "_") not in CHANGEABLE:
             raise ValueError(f"--changes: {option} cannot change in a run, only {', '.join(CHANGEABLE)} can")

@@ -3,7 +3,8 @@
 Source: Fu et al. 2025, supplement S2, Algorithm S1, Tables S1 and S2.
 
 In:  labelled and unlabelled clips (``--motion.labelled DIR --motion.unlabelled DIR``); without them, synthetic gaits.
-Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap``, ``checkpoints/``, ``policy/``.
+Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap``, ``checkpoints/``, ``policy/``, ``discriminator/``; with
+     ``--trials.start``, as in ``cpu``, also ``trials/``, the best of which ``policy/`` then is.
 
     python recipes/bbc_pretrain.py cpu --motion.labelled DIR --motion.unlabelled DIR --name my_run
     python recipes/bbc_pretrain.py cpu --resume runs/my_run          # goes on exactly where it stopped
@@ -16,6 +17,7 @@ Presets: ``smoke`` (seconds), ``quickstart`` (about five minutes), ``cpu`` (unde
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -24,10 +26,11 @@ from bbc_config import Config, ImitationConfig, at, check
 from bbc_penalties import asymmetry, distance_to_anchor, hold
 from bbc_presets import PRESETS
 from bbc_setup import Components, build, save_policy
+from bbc_trials import due, hold_trial, show_best
 from held_fixed import fit, infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import Laps, own_options, run
+from training_run import Laps, own_options, run, run_folder
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
@@ -184,9 +187,15 @@ def train(cfg: Config) -> Path:
         build,
         begin=begin,
         iterate=iterate,
-        save_policy=save_policy,
+        save_policy=save_shown,
         headline=HEADLINE,
     )
+
+
+def save_shown(parts: Components, cfg: Config, folder: Path) -> None:
+    """Write the controller that the run shows: the best that was tried, else the one of the moment."""
+    save_policy(parts, cfg, folder)
+    show_best(folder)
 
 
 def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
@@ -256,7 +265,11 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     metrics |= {f"prior/{name}": p for name, p in zip(BEHAVIOURS, parts.prior.probabilities, strict=True)}
     metrics |= tracking_error(batch)
     metrics["falls_per_minute"] = batch["next", "terminated"].float().mean() * 60.0 / parts.env.dt
-    return {name: float(value) for name, value in metrics.items()} | lap.metrics
+    numbers = {name: float(value) for name, value in metrics.items()}
+    if due(cfg, iteration + 1):
+        numbers |= hold_trial(cfg, run_folder(cfg), iteration + 1, partial(save_policy, parts, cfg))
+        lap("trial")
+    return numbers | lap.metrics
 
 
 if __name__ == "__main__":

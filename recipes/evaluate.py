@@ -141,9 +141,10 @@ def dog_figures(clips: list[MotionClip], name: str) -> dict[str, list[float]]:
 def compare(robot: metrics.Interval, dog: list[float], slack: float) -> dict[str, Any]:
     """Whether the robot's mean is within a quarter (or ``slack``) of the interval that the dog's clips span."""
     low, high = min(dog), max(dog)
-    within = low - max(TOLERANCE * low, slack) <= robot.estimate <= high + max(TOLERANCE * high, slack)
+    allowed = [low - max(TOLERANCE * low, slack), high + max(TOLERANCE * high, slack)]
     ratio = robot.estimate * len(dog) / sum(dog) if sum(dog) > 0 else math.nan
-    return {"robot": robot, "dog": [low, high], "ratio_to_mean": ratio, "within": within}
+    within = allowed[0] <= robot.estimate <= allowed[1]
+    return {"robot": robot, "dog": [low, high], "allowed": allowed, "ratio_to_mean": ratio, "within": within}
 
 
 def evaluate_behaviours(

@@ -68,6 +68,11 @@ def own_options(cfg: C) -> C:
     return replace(cli.read_config(cfg.resume, type(cfg)), **kept)  # type: ignore[type-var]
 
 
+def run_folder(cfg: RunConfig) -> Path:
+    """Where a run writes."""
+    return cfg.resume or cfg.runs / cfg.name
+
+
 class Laps:
     """Seconds of the parts of an iteration, as metrics ``time/NAME``.
 
@@ -157,7 +162,7 @@ def _run(
     headline: tuple[str, ...],
 ) -> Path:
     resumed, first = cfg.resume is not None, distributed.rank() == 0
-    folder = cfg.resume or cfg.runs / cfg.name
+    folder = run_folder(cfg)
     if first:
         cli.start_run(cfg, folder, resume=resumed, recipe=recipe, processes=distributed.size())
     distributed.wait()
