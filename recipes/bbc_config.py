@@ -3,6 +3,7 @@ the number, and the released code's values where those are silent."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -10,6 +11,7 @@ from typing import Literal
 from hardware import HardwareConfig
 
 from agility_rl.behaviours import BEHAVIOURS, RESAMPLE_PERIOD
+from agility_rl.envs.rhythm import REST
 from agility_rl.motion.stride_patterns import FREQUENCY_GROWTH
 from agility_rl.training.precision import Precision
 
@@ -77,6 +79,9 @@ class EnvConfig:
     walk_memory: float = 0.6
     """Strides after which what a walking foot did counts 1/e. With 0.6, 0.2 strides a second too many cost nothing,
     since robots swing in purer sines than dogs; more pays a beginner nothing for coming nearer (ours)."""
+    rhythm_rest: float = REST
+    """Fore-aft motion of the feet [m] beside which a stride counts: with more, short strides in haste are paid less,
+    and so is a step on the spot (ours)."""
     collision_weight: float = -10.0
     """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
     episode_length: float = 20.0
@@ -246,25 +251,27 @@ class Config(HardwareConfig):
 
 
 CHANGEABLE: tuple[str, ...] = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight", "env.progress_left")
-CHANGEABLE += ("env.standing_starts", "env.walk_memory")
+CHANGEABLE += ("env.standing_starts", "env.walk_memory", "env.rhythm_rest")
 CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
 """Options that may change during a run."""
 
 
 def check(cfg: Config) -> None:
-    """Refuse changes of options that cannot change, behaviours that do not exist, and trials that measure nothing.
+    """Refuse changes of options that cannot change, behaviours that do not exist, values that mean nothing.
 
     Raises:
         ValueError: naming the option and what can stand there.
     """
     if unknown := sorted(set(cfg.ppo.symmetric) - set(BEHAVIOURS)):
         raise ValueError(f"--ppo.symmetric: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
-    shares = [
-        cfg.env.standing_starts,
-        *(v for _, option, v in cfg.changes if option.replace("-", "_") == "env.standing_starts"),
-    ]
-    if bad := [share for share in shares if not 0.0 <= share <= 1.0]:
-        raise ValueError(f"--env.standing-starts: expected a share from 0 to 1, got {bad[0]}")
+    for name, least, most, expected in (
+        ("standing_starts", 0.0, 1.0, "a share from 0 to 1"),
+        ("rhythm_rest", 1e-6, math.inf, "a length above 0 m"),
+        ("walk_memory", 1e-6, math.inf, "strides above 0"),
+    ):
+        later = [value for _, option, value in cfg.changes if option.replace("-", "_") == f"env.{name}"]
+        if bad := [value for value in (getattr(cfg.env, name), *later) if not least <= value <= most]:
+            raise ValueError(f"--env.{name.replace('_', '-')}: expected {expected}, got {bad[0]}")
     for name, least in (("start", 1), ("every", 1), ("episodes", 1), ("seconds", 2), ("switches", 0)):
         if (value := getattr(cfg.trials, name)) is not None and value < least:
             raise ValueError(f"--trials.{name}: expected at least {least}, got {value}")

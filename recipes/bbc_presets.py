@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bbc_config import AdaptationConfig, Config, EnvConfig, ImitationConfig, MotionConfig, PPOConfig
+from bbc_config import AdaptationConfig, Config, EnvConfig, ImitationConfig, MotionConfig, PPOConfig, TrialsConfig
 
 PAPER = Config(
     motion=MotionConfig(mirror=False, standing_weight=1.0),
@@ -31,6 +31,7 @@ CPU = Config(
         (1000, "env.progress_left", 7.0),
         (1000, "env.standing_starts", 0.25),
         (1000, "env.walk_memory", 1.2),
+        (1000, "env.rhythm_rest", 0.01),
     ),
     motion=MotionConfig(one_sided=("canter",), offsets=(0, 8, 16, 23, 24), standing_weight=0.0),
     env=EnvConfig(
@@ -44,7 +45,8 @@ CPU = Config(
         progress_fade=(120, 120),
         progress_left=4.0,
         rhythm_weight=20.0,
-        walk_growth=1.0,
+        rhythm_rest=0.016,
+        walk_growth=1.2,
         jump_weight=16.0,
         jump_width=0.03,
     ),
@@ -86,6 +88,7 @@ CPU = Config(
         height_deviation=0.06,
     ),
     adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
+    trials=TrialsConfig(start=900),
 )
 POLISH = replace(
     CPU,

@@ -42,10 +42,11 @@ def heard(
     offset: float = 0.0,
     speed: float = 1.0,
     strides: float = MEMORY,
+    rest: float = REST,
 ) -> float:
     """Mean over the last two seconds of feet that swing so."""
     memory, skill, values = Rhythm(1, pattern), torch.tensor([2]), []
-    memory.memory[2] = strides
+    memory.memory[2], memory.rest = strides, rest
     told = torch.tensor([speed])
     for step in range(round(seconds / 0.02)):
         angle = 2.0 * math.pi * (frequency * 0.02 * step + ahead)
@@ -66,8 +67,16 @@ def test_where_the_feet_swing_about_and_how_far_does_not_count() -> None:
     right = heard(TROT, 2.0, pattern)
     assert heard(TROT, 2.0, pattern, offset=0.2, seconds=12.0) == pytest.approx(right, abs=0.02)
     assert heard(TROT, 2.0, pattern, amplitude=0.2) == pytest.approx(right, abs=0.05)
-    trembling = 1e-3**2 / (1e-3**2 + 2.0 * REST**2)  # power of a sine beside the threshold's
-    assert heard(TROT, 2.0, pattern, amplitude=1e-3) == pytest.approx(trembling * right, rel=0.1)
+
+
+@pytest.mark.parametrize("rest", [REST, 0.016])
+@pytest.mark.parametrize("amplitude", [1e-3, 0.02])
+def test_motion_counts_beside_that_of_rest(rest: float, amplitude: float) -> None:
+    """Of a sine the share that its power is beside the threshold's: short strides less, the more the threshold."""
+    pattern = pattern_of(TROT, 2.0)
+    share = amplitude**2 / (amplitude**2 + 2.0 * rest**2)
+    expected = share * heard(TROT, 2.0, pattern, rest=0.0)
+    assert heard(TROT, 2.0, pattern, amplitude=amplitude, rest=rest) == pytest.approx(expected, rel=0.1)
 
 
 @pytest.mark.parametrize("strides", [MEMORY, 1.2])
