@@ -27,11 +27,11 @@ CPU = Config(
         (500, "ppo.desired_kl", 0.008),
         (500, "imitation.imitation_reward", 6.0),
         (500, "env.jump_weight", 20.0),
+        (700, "env.canter_stance", 0.03),
         (1000, "env.jump_weight", 28.0),
         (1000, "env.progress_left", 7.0),
         (1000, "env.standing_starts", 0.25),
         (1000, "env.walk_memory", 1.2),
-        (1000, "env.rhythm_rest", 0.01),
     ),
     motion=MotionConfig(one_sided=("canter",), offsets=(0, 8, 16, 23, 24), standing_weight=0.0),
     env=EnvConfig(
@@ -45,8 +45,7 @@ CPU = Config(
         progress_fade=(120, 120),
         progress_left=4.0,
         rhythm_weight=20.0,
-        rhythm_rest=0.016,
-        walk_growth=1.2,
+        walk_growth=1.0,
         jump_weight=16.0,
         jump_width=0.03,
     ),
@@ -88,7 +87,7 @@ CPU = Config(
         height_deviation=0.06,
     ),
     adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
-    trials=TrialsConfig(start=900),
+    trials=TrialsConfig(start=1000),
 )
 POLISH = replace(
     CPU,

@@ -19,8 +19,7 @@ MEMORY = 0.6
 """Strides after which what a foot did counts 1/e: less blurs the phase and forgives a wrong stride frequency, more
 pays nothing for coming nearer from far off."""
 REST = 0.006
-"""Fore-aft motion [m] beside which a standing robot's trembling is no stride, but a step on the spot is. More favours
-long strides: who takes short ones in haste is paid less."""
+"""Fore-aft motion [m] beside which a standing robot's trembling is no stride, but a step on the spot is."""
 STANCE_MEMORY = 2.0
 """Strides after which whether a foot stood counts 1/e."""
 STANCE_WIDTH = 0.15
@@ -45,8 +44,8 @@ class Rhythm:
     the motion that has the frequency, beside the dogs' own share s, times the agreements of the duty factor and of the
     phases with the pattern's or its mirror image's, is
 
-    .. math:: \min\left(1, \frac{1}{s} \frac{2 \sum |z_i|^2}{\sum p_i + 4 r^2}\right)
-              \exp\left(-\frac{(d - d^*)^2}{0.15^2}\right)
+    .. math:: \min\left(1, \frac{1}{s} \frac{2 \sum |z_i|^2}{\sum p_i + 4 \cdot 0.006^2}\right)
+              \exp\left(-\frac{(d - d^* - l)^2}{0.15^2}\right)
               \max_{\phi^*} \frac{1}{6} \sum_{ij} e^{8 (\cos 2\pi(\phi_{ij} - \phi^*_{ij}) - 1)},
               \quad \phi_{ij} = \tfrac{1}{2\pi} \arg z_i \bar z_j.
 
@@ -61,7 +60,7 @@ class Rhythm:
 
     Attributes:
         memory: m of each behaviour [strides], ``[5]``; :data:`MEMORY` unless set.
-        rest: r [m]; :data:`REST` unless set.
+        longer_stance: l of each behaviour, ``[5]``; 0 unless set.
 
     Example:
         >>> from tensordict import TensorDict
@@ -80,7 +79,7 @@ class Rhythm:
         device = patterns["frequency"].device
         self._figures = torch.stack([patterns[name] for name in _FIGURES], -1)  # [5, 5]
         self.memory = torch.full((len(BEHAVIOURS),), MEMORY, device=device)
-        self.rest = REST
+        self.longer_stance = torch.zeros(len(BEHAVIOURS), device=device)
         self._images = torch.stack([patterns[name] for name in ("phase", "mirrored_phase")], 1)  # [5, 2, 6]
         self._swing = torch.zeros(num_robots, 4, dtype=torch.complex64, device=device)
         self._power, self._mean = (torch.zeros(num_robots, 4, device=device) for _ in range(2))
@@ -104,6 +103,7 @@ class Rhythm:
         """The same, of fore-aft positions ``[N, 4]`` [m] of the feet, ``dt`` [s] after the last ones; the trunk goes
         ``forward`` ``[2, N]`` [m/s], now and on the mean, and is told to go at speeds ``[N]`` [m/s]."""
         usual, usual_speed, growth, duty, dogs_share = self._figures[skill].unbind(-1)
+        duty = duty + self.longer_stance[skill]
         step = dt * torch.maximum(usual + growth * (speed - usual_speed), 0.5 * usual)[:, None]
         self._swing = self._swing.masked_fill(self._fresh, 0.0)
         self._power = self._power.masked_fill(self._fresh, 0.0)
@@ -120,7 +120,7 @@ class Rhythm:
         turn = torch.polar(torch.exp(-decay), 2.0 * math.pi * step)
         self._swing = self._swing * turn + aside * decay
         self._power = self._power + (aside.square() - self._power) * decay / 2.0
-        share = 2.0 * self._swing.abs().square().mean(-1) / (self._power.mean(-1) + self.rest**2) / dogs_share
+        share = 2.0 * self._swing.abs().square().mean(-1) / (self._power.mean(-1) + REST**2) / dogs_share
         phase = self._swing[:, self._first] * self._swing[:, self._second].conj()
         off = phase.angle()[:, None] - 2.0 * math.pi * self._images[skill]
         agreement = torch.exp(SHARPNESS * (torch.cos(off) - 1.0)).mean(-1)

@@ -25,14 +25,6 @@ Source: median stride frequencies of the dogs walking in the unlabelled clips, 0
 1.12 at 0.34, 1.17 at 0.43, 1.37 at 0.54 (85 stretches of 3 s). Galloping dogs hardly change theirs (Heglund, Taylor
 and McMahon 1974, Science 186:1112)."""
 
-LONGER_STANCE: Mapping[str, float] = {"canter": 0.03}
-"""Share of time for which a foot shall stand more than in the labelled clips. The canter's run at 1.9 to 3.3 m/s,
-commands at 0.8 to 2: a robot that has to stand as shortly as they do goes faster than told.
-
-Source: :func:`~agility_rl.motion.gait_analysis.stance_share` of the dogs cantering in the unlabelled clips, 0.47 at
-0.86 m/s, 0.41 at 1.23, 0.35 at 1.66, 0.32 at 2.11 (56 stretches of 1.2 s): at the mean commanded speed 0.06 more than
-the 0.32 of the labelled ones, of which a half is asked for."""
-
 
 def mirrored(cross: Tensor) -> Tensor:
     """Cross-spectra ``[*B, 6]`` of the same gait in a mirror: left feet are right ones.
@@ -60,10 +52,10 @@ def stride_patterns(clips: Sequence[MotionClip], growth: Mapping[str, float] = F
 
     Returns:
         ``[5]`` in the order of :data:`~agility_rl.behaviours.BEHAVIOURS`: ``frequency`` [Hz] at ``speed`` [m/s] and
-        how it grows with that, ``growth`` [1/m]; ``duty``, the share of time in which a foot shall stand
-        (:data:`LONGER_STANCE`); ``share``, how much of the mean square of the feet's motion a sine of that frequency
-        is; ``phase`` and ``mirrored_phase`` ``[5, 6]`` [strides], in the order of
-        :data:`~agility_rl.go2.constants.FOOT_PAIRS`, how far the first foot is ahead of the second.
+        how it grows with that, ``growth`` [1/m]; ``duty``, the share of time in which a foot stands; ``share``, how
+        much of the mean square of the feet's motion a sine of that frequency is; ``phase`` and ``mirrored_phase``
+        ``[5, 6]`` [strides], in the order of :data:`~agility_rl.go2.constants.FOOT_PAIRS`, how far the first foot is
+        ahead of the second.
 
     Raises:
         MotionError: if a behaviour has no clip.
@@ -88,7 +80,6 @@ def stride_patterns(clips: Sequence[MotionClip], growth: Mapping[str, float] = F
             total = total + torch.where(nearer, image, cross)
         crosses.append(total)
     whole, (frequency, speed, share, duty) = torch.stack(crosses), torch.stack(figures, 1)
-    duty = duty + torch.tensor([LONGER_STANCE.get(name, 0.0) for name in BEHAVIOURS])
     quickening = torch.tensor([growth.get(name, 0.0) for name in BEHAVIOURS])
     phases = {"phase": whole.angle() / (2 * torch.pi), "mirrored_phase": mirrored(whole).angle() / (2 * torch.pi)}
     pace = {"frequency": frequency, "speed": speed, "growth": quickening, "duty": duty, "share": share}
