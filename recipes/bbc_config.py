@@ -3,7 +3,6 @@ the number, and the released code's values where those are silent."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -75,9 +74,6 @@ class EnvConfig:
     """Weight of a reward for the stride frequency and the foot phases of the behaviour's labelled clips (ours)."""
     walk_growth: float = FREQUENCY_GROWTH["walk"]
     """Strides that a second shall hold more of for each m/s that the walk is commanded faster [1/m]."""
-    walk_memory: float = 0.6
-    """Strides after which what a walking foot did counts 1/e. With 0.6, 0.2 strides a second too many cost nothing,
-    since robots swing in purer sines than dogs; more pays a beginner nothing for coming nearer (ours)."""
     canter_stance: float = 0.0
     """Share of time for which a cantering foot shall stand more than in the labelled clips (ours). Those run at 1.9 to
     3.3 m/s, commands at 0.8 to 2: a robot that has to stand as shortly as they do goes faster than told. Dogs cantering
@@ -253,7 +249,7 @@ class Config(HardwareConfig):
 
 
 CHANGEABLE: tuple[str, ...] = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight", "env.progress_left")
-CHANGEABLE += ("env.standing_starts", "env.walk_memory", "env.canter_stance")
+CHANGEABLE += ("env.standing_starts", "env.canter_stance")
 CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
 """Options that may change during a run."""
 
@@ -269,7 +265,6 @@ def check(cfg: Config) -> None:
     for name, least, most, expected in (
         ("standing_starts", 0.0, 1.0, "a share from 0 to 1"),
         ("canter_stance", -1.0, 1.0, "a share of time"),
-        ("walk_memory", 1e-6, math.inf, "strides above 0"),
     ):
         later = [value for _, option, value in cfg.changes if option.replace("-", "_") == f"env.{name}"]
         if bad := [value for value in (getattr(cfg.env, name), *later) if not least <= value <= most]:

@@ -20,18 +20,13 @@ PAPER = Config(
     ppo=PPOConfig(minibatches=4),
 )
 CPU = Config(
-    iterations=1150,
+    iterations=1000,
     max_minutes=58.0,
     changes=(
         (350, "ppo.entropy", 0.0005),
         (500, "ppo.desired_kl", 0.008),
         (500, "imitation.imitation_reward", 6.0),
         (500, "env.jump_weight", 20.0),
-        (700, "env.canter_stance", 0.03),
-        (1000, "env.jump_weight", 28.0),
-        (1000, "env.progress_left", 7.0),
-        (1000, "env.standing_starts", 0.25),
-        (1000, "env.walk_memory", 1.2),
     ),
     motion=MotionConfig(one_sided=("canter",), offsets=(0, 8, 16, 23, 24), standing_weight=0.0),
     env=EnvConfig(
@@ -45,7 +40,8 @@ CPU = Config(
         progress_fade=(120, 120),
         progress_left=4.0,
         rhythm_weight=20.0,
-        walk_growth=1.0,
+        walk_growth=0.8,
+        canter_stance=0.03,
         jump_weight=16.0,
         jump_width=0.03,
     ),
@@ -87,7 +83,7 @@ CPU = Config(
         height_deviation=0.06,
     ),
     adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
-    trials=TrialsConfig(start=1000),
+    trials=TrialsConfig(start=900),
 )
 POLISH = replace(
     CPU,

@@ -213,7 +213,6 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         parts.env.rewards["velocity_progress"] = term._replace(weight=cfg.env.progress_weight - faded)
     parts.env.standing_starts = cfg.env.standing_starts
     if parts.env.rhythm is not None:
-        parts.env.rhythm.memory[BEHAVIOURS.index("walk")] = cfg.env.walk_memory
         parts.env.rhythm.longer_stance[BEHAVIOURS.index("canter")] = cfg.env.canter_stance
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     parts.env.set_skill_probabilities(parts.prior.sampling_probabilities)

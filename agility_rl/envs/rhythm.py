@@ -59,7 +59,6 @@ class Rhythm:
             :func:`agility_rl.motion.stride_patterns.stride_patterns` makes them; where it is, the tensors are.
 
     Attributes:
-        memory: m of each behaviour [strides], ``[5]``; :data:`MEMORY` unless set.
         longer_stance: l of each behaviour, ``[5]``; 0 unless set.
 
     Example:
@@ -78,7 +77,6 @@ class Rhythm:
     def __init__(self, num_robots: int, patterns: TensorDictBase) -> None:
         device = patterns["frequency"].device
         self._figures = torch.stack([patterns[name] for name in _FIGURES], -1)  # [5, 5]
-        self.memory = torch.full((len(BEHAVIOURS),), MEMORY, device=device)
         self.longer_stance = torch.zeros(len(BEHAVIOURS), device=device)
         self._images = torch.stack([patterns[name] for name in ("phase", "mirrored_phase")], 1)  # [5, 2, 6]
         self._swing = torch.zeros(num_robots, 4, dtype=torch.complex64, device=device)
@@ -114,7 +112,7 @@ class Rhythm:
         now, usually = forward[..., None]
         standing = in_stance((position - last) / dt + now, usually).float().mean(-1)
         self._stance = stance + (standing - stance) * step[:, 0] / STANCE_MEMORY
-        decay = step / self.memory[skill, None]
+        decay = step / MEMORY
         self._mean = mean + (position - mean) * decay / 2.5
         aside = position - self._mean
         turn = torch.polar(torch.exp(-decay), 2.0 * math.pi * step)

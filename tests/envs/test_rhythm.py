@@ -41,11 +41,9 @@ def heard(
     seconds: float = 8.0,
     offset: float = 0.0,
     speed: float = 1.0,
-    strides: float = MEMORY,
 ) -> float:
     """Mean over the last two seconds of feet that swing so."""
     memory, skill, values = Rhythm(1, pattern), torch.tensor([2]), []
-    memory.memory[2] = strides
     told = torch.tensor([speed])
     for step in range(round(seconds / 0.02)):
         angle = 2.0 * math.pi * (frequency * 0.02 * step + ahead)
@@ -70,13 +68,12 @@ def test_where_the_feet_swing_about_and_how_far_does_not_count() -> None:
     assert heard(TROT, 2.0, pattern, amplitude=1e-3) == pytest.approx(trembling * right, rel=0.1)
 
 
-@pytest.mark.parametrize("strides", [MEMORY, 1.2])
 @pytest.mark.parametrize("detuned", [0.25, 0.5, 1.0])
-def test_a_wrong_stride_frequency_loses_what_a_resonator_loses(strides: float, detuned: float) -> None:
+def test_a_wrong_stride_frequency_loses_what_a_resonator_loses(detuned: float) -> None:
     """Power of a first-order resonator, 1 / (1 + (2 pi m d)^2); its answer to negative frequencies blurs it."""
-    expected = 1.0 / (1.0 + (2.0 * math.pi * strides * detuned) ** 2)
+    expected = 1.0 / (1.0 + (2.0 * math.pi * MEMORY * detuned) ** 2)
     pattern = pattern_of(TROT, 1.5)
-    assert heard(TROT, 1.5 * (1.0 + detuned), pattern, strides=strides) == pytest.approx(expected, abs=0.08)
+    assert heard(TROT, 1.5 * (1.0 + detuned), pattern) == pytest.approx(expected, abs=0.08)
 
 
 def test_the_stride_frequency_grows_with_the_commanded_speed_and_is_never_less_than_half() -> None:
