@@ -213,7 +213,7 @@ class AdaptationConfig:
 class TrialsConfig:
     start: int | None = None
     """Iteration after which the controller is first measured as ``evaluate.py`` does; what the run shows is then the
-    best one that was, not the last. Never when not given. Ours (docs/bbc.md, The last steps)."""
+    best one that was, not the last. Never when not given. Ours (docs/bbc.md, Trials)."""
     every: int = 25
     """Iterations between two trials, of which one takes about as long as ten iterations."""
     episodes: int = 100
