@@ -69,8 +69,7 @@ class LocomotionEnv(EnvBase):
     Raises:
         ValueError: if the simulator holds another number of robots or, with encounters, another world, a reference
             entry is missing or too short, a behaviour has no reference state, ``standing_starts`` is no share, the
-            offsets do not rise from zero, or
-            commands shall be redrawn more often than at every control step.
+            offsets do not rise from zero, or commands shall be redrawn more often than at every control step.
 
     Example:
         >>> env = LocomotionEnv(2, simulator_options={"num_threads": 1})
