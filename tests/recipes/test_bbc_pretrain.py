@@ -264,10 +264,13 @@ def test_what_is_saved_is_the_moving_average_of_weights(module: Callable[[str], 
 
 
 def test_two_processes_train_one_policy_and_resume_bit_for_bit(tmp_path: Path) -> None:
-    printed = run_two(tmp_path, "--name", "whole", "--iterations", "4").stdout
+    trials = ("--trials.start", "4", "--trials.episodes", "1", "--trials.seconds", "2", "--trials.switches", "0")
+    printed = run_two(tmp_path, "--name", "whole", "--iterations", "4", *trials).stdout
     assert printed.count("saved") == 1, "one of them writes"
+    assert read_scalars(tmp_path / "whole")["trial/targets"][0].tolist() == [4], "one of them measures"
+    assert Artifact.load(tmp_path / "whole" / "policy").manifest["trial"]["iteration"] == 4
     assert read_scalars(tmp_path / "whole")["reward/task"][0].tolist() == [1, 2, 3, 4]
-    run_two(tmp_path, "--name", "halves", "--iterations", "2")
+    run_two(tmp_path, "--name", "halves", "--iterations", "2", *trials)
     assert (tmp_path / "halves" / "checkpoints" / "process-1").is_dir()
     run_two(tmp_path, "--resume", str(tmp_path / "halves"), "--iterations", "4")
     whole, halves = (Artifact.load(tmp_path / name / "policy").state for name in ("whole", "halves"))
