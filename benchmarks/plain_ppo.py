@@ -246,7 +246,11 @@ class Plain:
         names = (*CRITIC, *((keys.HISTORY,) if pull > 0.0 or ppo.critic_history else ()))
         flat = {name: batch[name].flatten(0, 1) for name in (*names, "estimate", "loc", "scale", "action", "log_prob")}
         flat["target"] = (advantage + batch["value"]).flatten()
-        flat["advantage"] = ((advantage - advantage.mean()) / (advantage.std() + 1e-8)).flatten()
+        flat["advantage"], group = advantage.flatten(), batch[keys.SKILL].flatten() * ppo.by_behaviour
+        for index in group.unique():
+            own = group == index
+            deviation, mean = torch.std_mean(flat["advantage"][own])
+            flat["advantage"][own] = (flat["advantage"][own] - mean) / (deviation + 1e-8)
         count = self.steps * self.n
         for _ in range(ppo.epochs):
             for rows in torch.randperm(count, generator=self.generator).split(count // ppo.minibatches)[

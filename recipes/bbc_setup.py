@@ -193,6 +193,7 @@ def build(cfg: Config) -> Components:
             minibatches=ppo.minibatches,
             max_grad_norm=ppo.max_grad_norm,
             keep=["loc", "scale", INFERRED, ANCHORED, keys.SKILL],
+            groups=(keys.SKILL, len(BEHAVIOURS)) if ppo.by_behaviour else None,
             divergence=divergence,
             schedule=schedule,
             precision=hidden_precision(ppo.precision, device),

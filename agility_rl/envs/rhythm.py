@@ -34,7 +34,7 @@ _REAL = ("power", "mean", "last", "stance", "fresh")
 class Rhythm:
     r"""Short memory of the fore-aft motion of the feet, and how much of it follows a dog's pattern.
 
-    A resonator at the behaviour's stride frequency :math:`f = f_0 + g\,(|v^*| - v_0)`, at least :math:`f_0 / 2`,
+    A resonator at the behaviour's stride frequency :math:`f = f_0 - s + g\,(|v^*| - v_0)`, at least :math:`f_0 / 2`,
     follows each foot's fore-aft position x about its mean,
 
     .. math:: \dot z_i = \left(2 \pi i f - \tfrac{f}{m}\right) z_i + \tfrac{f}{m}\,(x_i - \bar x_i),
@@ -60,6 +60,8 @@ class Rhythm:
 
     Attributes:
         longer_stance: l of each behaviour, ``[5]``; 0 unless set.
+        slower: s of each behaviour [Hz], ``[5]``; 0 unless set.
+        emphasis: by what the agreement of each behaviour is multiplied, ``[5]``; 1 unless set.
 
     Example:
         >>> from tensordict import TensorDict
@@ -78,6 +80,8 @@ class Rhythm:
         device = patterns["frequency"].device
         self._figures = torch.stack([patterns[name] for name in _FIGURES], -1)  # [5, 5]
         self.longer_stance = torch.zeros(len(BEHAVIOURS), device=device)
+        self.slower = torch.zeros(len(BEHAVIOURS), device=device)
+        self.emphasis = torch.ones(len(BEHAVIOURS), device=device)
         self._images = torch.stack([patterns[name] for name in ("phase", "mirrored_phase")], 1)  # [5, 2, 6]
         self._swing = torch.zeros(num_robots, 4, dtype=torch.complex64, device=device)
         self._power, self._mean = (torch.zeros(num_robots, 4, device=device) for _ in range(2))
@@ -91,7 +95,8 @@ class Rhythm:
         self._fresh = self._fresh | mask[:, None]
 
     def update(self, state: LocomotionState, skill: Tensor) -> Tensor:
-        """Follow the feet for one control step, in behaviours int64 ``[N]``; returns the agreement ``[N]``, 0 to 1."""
+        """Follow the feet for one control step, in behaviours int64 ``[N]``; returns the agreement ``[N]``, 0 to the
+        behaviour's emphasis."""
         cosine, sine = state.pitch.cos()[:, None], state.pitch.sin()[:, None]
         level = state.feet[..., 0] * cosine + state.feet[..., 2] * sine
         forward = torch.stack((state.linear_velocity[:, 0], state.mean_velocity[:, 0]))
@@ -102,7 +107,8 @@ class Rhythm:
         ``forward`` ``[2, N]`` [m/s], now and on the mean, and is told to go at speeds ``[N]`` [m/s]."""
         usual, usual_speed, growth, duty, dogs_share = self._figures[skill].unbind(-1)
         duty = duty + self.longer_stance[skill]
-        step = dt * torch.maximum(usual + growth * (speed - usual_speed), 0.5 * usual)[:, None]
+        asked = usual - self.slower[skill] + growth * (speed - usual_speed)
+        step = dt * torch.maximum(asked, 0.5 * usual)[:, None]
         self._swing = self._swing.masked_fill(self._fresh, 0.0)
         self._power = self._power.masked_fill(self._fresh, 0.0)
         mean = torch.where(self._fresh, position, self._mean)
@@ -123,7 +129,7 @@ class Rhythm:
         off = phase.angle()[:, None] - 2.0 * math.pi * self._images[skill]
         agreement = torch.exp(SHARPNESS * (torch.cos(off) - 1.0)).mean(-1)
         miss = (self._stance - duty) / STANCE_WIDTH
-        return share.clamp(max=1.0) * agreement.amax(-1) * torch.exp(-miss.square())
+        return self.emphasis[skill] * share.clamp(max=1.0) * agreement.amax(-1) * torch.exp(-miss.square())
 
     def state_dict(self) -> dict[str, Any]:
         """The memory: ``swing [N, 4, 2]``, real and imaginary part [m]; ``power`` [m^2], ``mean`` and ``last`` [m]

@@ -136,12 +136,20 @@ class MotionDataset:
         if mirror:
             labelled, unlabelled = _with_mirror_images(labelled, one_sided), _with_mirror_images(unlabelled)
         self.labelled_clips = tuple(labelled)
-        self._labelled = self._pool(labelled, [BEHAVIOURS.index(str(clip.label)) for clip in labelled], features)
-        self._unlabelled = self._pool(unlabelled, [0] * len(unlabelled), features)
+        groups = [BEHAVIOURS.index(str(clip.label)) for clip in labelled]
+        frames = torch.cat([features(clip) for clip in labelled]) if labelled else torch.zeros(0)
+        self._labelled = _pool(frames, labelled, groups, self.span)
+        # An episode may start anywhere. Frames near the ends of a clip are in few whole samples, and a clip that is
+        # hardly longer than one has few: a robot that rarely started there falls there.
+        self._pairs = _pool(frames, labelled, groups, 1)
+        self._unlabelled = _pool(
+            torch.cat([features(clip) for clip in unlabelled]), unlabelled, [0] * len(unlabelled), self.span
+        )
         if standing_weight != 1.0:
             standing = torch.cat([_standing(clip) for clip in unlabelled])[self._unlabelled.starts]
             self._unlabelled.weights[standing] *= standing_weight
         self._labelled_table = _cumulative(self._labelled, NUM_BEHAVIOURS)
+        self._pairs_table = _cumulative(self._pairs, NUM_BEHAVIOURS)
         self._unlabelled_table = _cumulative(self._unlabelled, 1)
         self.as_recorded = bool((self._unlabelled.weights == self._unlabelled.weights[0]).all())
         self._present = torch.bincount(self._labelled.groups, minlength=NUM_BEHAVIOURS) > 0
@@ -159,7 +167,7 @@ class MotionDataset:
         moved = copy.copy(self)
         for name in ("_offsets", "_present"):
             setattr(moved, name, getattr(self, name).to(device))
-        for name in ("_labelled", "_unlabelled", "_labelled_table", "_unlabelled_table"):
+        for name in ("_labelled", "_pairs", "_unlabelled", "_labelled_table", "_pairs_table", "_unlabelled_table"):
             part = getattr(self, name)
             setattr(moved, name, type(part)(*(tensor.to(device) for tensor in part)))
         moved._states = {name: value.to(device) for name, value in self._states.items()}
@@ -212,6 +220,8 @@ class MotionDataset:
     def sample_states(self, skill: Tensor, generator: torch.Generator | None) -> TensorDict:
         """One labelled frame of each given skill, to start an episode from.
 
+        All frames of a skill come alike, by the weights of their clips; the first and the last of a clip half as often.
+
         Args:
             skill: int64 ``[n]``.
             generator: source of randomness.
@@ -230,8 +240,8 @@ class MotionDataset:
             raise MotionError(
                 f"expected labelled clips of {BEHAVIOURS[int(absent[0])]!r} to start from, there are none"
             )
-        pool, pick = self._labelled, _draw(self._labelled_table, skill, generator)
-        index = pool.starts[pick] + torch.randint(self.span + 1, pick.shape, generator=generator, device=self.device)
+        pool, pick = self._pairs, _draw(self._pairs_table, skill, generator)
+        index = pool.starts[pick] + torch.randint(2, pick.shape, generator=generator, device=self.device)
         before = torch.maximum(
             index[:, None] + torch.arange(-self.span, 0, device=self.device), pool.clips[pick][:, None]
         )
@@ -256,29 +266,30 @@ class MotionDataset:
         labelled = sum(self._class_seconds.values())
         return labelled / (labelled + self._unlabelled_seconds)
 
-    def _pool(self, clips: Sequence[MotionClip], groups: Sequence[int], features: FrameFeatures) -> _Pool:
-        frames, starts, weights, members, firsts, total = [], [], [], [], [], 0
-        for clip, group in zip(clips, groups, strict=True):
-            count = clip.num_frames - self.span
-            if count < 1:
-                raise MotionError(
-                    f"clip {clip.name!r}: {clip.num_frames} frames, expected at least the {self.span + 1} of a sample"
-                )
-            frames.append(features(clip))
-            starts.append(torch.arange(total, total + count))
-            weights.append(torch.full((count,), clip.weight, dtype=torch.float64))
-            members.append(torch.full((count,), group))
-            firsts.append(torch.full((count,), total))
-            total += clip.num_frames
-        if not clips:
-            empty = torch.zeros(0, dtype=torch.int64)
-            return _Pool(torch.zeros(0), empty, empty.double(), empty, empty)
-        return _Pool(*(torch.cat(parts) for parts in (frames, starts, weights, members, firsts)))
-
     def _gather(self, pool: _Pool, pick: Tensor) -> Tensor:
         # index_select over a flat index is several times faster than indexing with a matrix.
         index = pool.starts[pick][:, None] + self._offsets
         return pool.frames.index_select(0, index.flatten()).unflatten(0, index.shape)
+
+
+def _pool(frames: Tensor, clips: Sequence[MotionClip], groups: Sequence[int], span: int) -> _Pool:
+    """The frames of clips, and every start of a sample whose last frame is ``span`` frames behind its first."""
+    starts, weights, members, firsts, total = [], [], [], [], 0
+    for clip, group in zip(clips, groups, strict=True):
+        count = clip.num_frames - span
+        if count < 1:
+            raise MotionError(
+                f"clip {clip.name!r}: {clip.num_frames} frames, expected at least the {span + 1} of a sample"
+            )
+        starts.append(torch.arange(total, total + count))
+        weights.append(torch.full((count,), clip.weight, dtype=torch.float64))
+        members.append(torch.full((count,), group))
+        firsts.append(torch.full((count,), total))
+        total += clip.num_frames
+    if not clips:
+        empty = torch.zeros(0, dtype=torch.int64)
+        return _Pool(frames, empty, empty.double(), empty, empty)
+    return _Pool(frames, *(torch.cat(parts) for parts in (starts, weights, members, firsts)))
 
 
 class _Table(NamedTuple):

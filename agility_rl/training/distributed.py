@@ -84,18 +84,27 @@ def average(value: Tensor) -> Tensor:
     return value if size() == 1 else total(value) / size()
 
 
-def moments(value: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of all elements of all processes, which hold equally many.
+def moments(value: Tensor, group: Tensor, num_groups: int) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of each group over all processes; 0 and 1 of one that has fewer than two elements.
+
+    Args:
+        value: ``[n]``.
+        group: int64 ``[n]``, which one each element belongs to.
+        num_groups: G, of all processes.
+
+    Returns:
+        Both ``[G]``.
 
     Example:
-        >>> moments(torch.tensor([1.0, 3.0]))
-        (tensor(2.), tensor(1.4142))
+        >>> moments(torch.tensor([1.0, 3.0, 5.0]), torch.tensor([0, 0, 1]), 2)
+        (tensor([2., 0.]), tensor([1.4142, 1.0000]))
     """
-    if size() == 1:
-        return value.mean(), value.std()
-    mean = average(value.mean())
-    squares = total((value - mean).square().sum())
-    return mean, (squares / (value.numel() * size() - 1)).sqrt()
+    member = torch.nn.functional.one_hot(group, num_groups).to(value.dtype)
+    count = total(member.sum(0))
+    known = count > 1.0
+    mean = torch.where(known, total((member * value[:, None]).sum(0)) / count.clamp(min=1.0), 0.0)
+    squares = total((member * (value[:, None] - mean).square()).sum(0))
+    return mean, torch.where(known, squares / (count - 1.0).clamp(min=1.0), 1.0).sqrt()
 
 
 def average_gradients(parameters: Iterable[nn.Parameter]) -> None:

@@ -43,9 +43,10 @@ class FirstGroup:
 class PPOUpdate:
     """Descends a PPO loss over a collected batch.
 
-    Advantages are normalised over the whole batch. After each epoch the divergence between the policy that collected
-    and the present one, on the last minibatch, may change the learning rate. Of several processes
-    (:mod:`agility_rl.training.distributed`), each brings a batch: moments, gradients and divergence are those of all.
+    Advantages are normalised over the whole batch, or within each group of it. After each epoch the divergence between
+    the policy that collected and the present one, on the last minibatch, may change the learning rate. Of several
+    processes (:mod:`agility_rl.training.distributed`), each brings a batch: moments, gradients and divergence are those
+    of all.
 
     Source: Schulman et al. 2017, arXiv:1707.06347; Table S1 (clip, learning rate); normalisation and adaptive rate:
     released code (method notes, section 3.7).
@@ -57,6 +58,8 @@ class PPOUpdate:
         minibatches: minibatches of a pass.
         max_grad_norm: bound of the gradient's norm.
         keep: entries of the batch beside the loss's own that ``extra`` or ``divergence`` read.
+        groups: an int64 entry ``[T, N]`` and the number of its values: advantages are normalised within each of them.
+            Of tasks that earn differently, the ones that earn more would else be learned at the others' expense.
         divergence: KL divergence [nat] of a minibatch, ``()``; ``None`` with a fixed learning rate.
         schedule: adapts the learning rate to that divergence.
         precision: ``torch.bfloat16`` runs the hidden layers of policy and critic in it, about twice as fast where the
@@ -83,6 +86,7 @@ class PPOUpdate:
         minibatches: int,
         max_grad_norm: float = 1.0,
         keep: Sequence[NestedKey] = (),
+        groups: tuple[NestedKey, int] | None = None,
         divergence: Extra | None = None,
         schedule: KLAdaptiveLR | None = None,
         precision: torch.dtype = torch.float32,
@@ -95,6 +99,7 @@ class PPOUpdate:
         self.minibatches = minibatches
         self.max_grad_norm = max_grad_norm
         self.keep = tuple(keep)
+        self.groups = groups
         self.divergence = divergence
         self.schedule = schedule
         self.precision = precision
@@ -118,16 +123,14 @@ class PPOUpdate:
         Returns:
             Metrics of the last minibatch, ``kl`` and ``learning_rate``.
         """
-        advantage = batch["advantage"]
-        mean, deviation = distributed.moments(advantage)
-        batch["advantage"] = (advantage - mean) / (deviation + 1e-8)
+        batch["advantage"] = self._normalized(batch)
         names = dict.fromkeys((*self.loss.in_keys, "advantage", "value_target", *self.keep))
         flat = batch.select(*(name for name in names if "next" not in name), strict=False).flatten()
         size = flat.numel() // self.minibatches
         if size < 1:
             raise ValueError(f"expected at least {self.minibatches} samples, one a minibatch, got {flat.numel()}")
         parameters = distributed.optimized(self.optimizer)
-        device = advantage.device.type
+        device = batch["advantage"].device.type
         metrics: dict[str, Tensor] = {}
         for _ in range(self.epochs):
             order = permutation(flat.numel(), generator)
@@ -153,3 +156,12 @@ class PPOUpdate:
                     self.schedule.step(metrics["kl"])
         metrics["learning_rate"] = torch.tensor(self.optimizer.param_groups[0]["lr"])
         return metrics
+
+    def _normalized(self, batch: TensorDictBase) -> Tensor:
+        """Advantages ``[T, N, 1]`` of mean 0 and deviation 1 in each group."""
+        advantage = batch["advantage"]
+        name, number = self.groups or (None, 1)
+        flat = advantage.flatten()
+        group = torch.zeros_like(flat, dtype=torch.int64) if name is None else batch[name].flatten()
+        mean, deviation = (moment[group].view_as(advantage) for moment in distributed.moments(flat, group, number))
+        return (advantage - mean) / (deviation + 1e-8)

@@ -139,6 +139,16 @@ def test_states_bring_the_frames_before_them(clips: dict[str, MotionClip], gener
     assert (states["past_motion"][..., 0] == 1.0).all()  # never another clip's
 
 
+def test_states_are_all_frames_alike_however_long_a_sample_is(make_clip: ClipMaker, generator: torch.Generator) -> None:
+    """A clip of 11 frames beside one of 41 has 10 of 50 pairs, but only 1 of the 32 samples that span 10 frames."""
+    short, long = (make_clip(frames=frames, label="walk") for frames in (11, 41))
+    short = replace(short, root_position=torch.arange(100.0, 111.0)[:, None].expand(11, 3))
+    dataset = MotionDataset([long, short], [long], offsets=(0, 10))
+    heights = dataset.sample_states(torch.zeros(50_000, dtype=torch.int64), generator)["root_height"][:, 0]
+    counts = torch.stack([(heights == 100.0 + frame).sum() for frame in range(11)]).float()
+    torch.testing.assert_close(counts, torch.tensor([500.0, *[1000.0] * 9, 500.0]), rtol=0.0, atol=5 * 1000**0.5)
+
+
 def test_equal_generators_draw_equal_samples(dataset: MotionDataset) -> None:
     draws = [dataset.sample_labelled(64, torch.Generator().manual_seed(3))["motion"] for _ in range(2)]
     assert torch.equal(*draws)

@@ -33,6 +33,7 @@ def experience(rows):
     batch["advantage"] = torch.randn(6, 8, 1, generator=generator)
     batch["value_target"] = torch.randn(6, 8, 1, generator=generator)
     batch["state_value"] = torch.zeros(6, 8, 1)
+    batch["skill"] = torch.randint(3, (6, 8), generator=generator)
     return batch[:, rows].contiguous()
 
 def updated(rows):
@@ -43,7 +44,7 @@ def updated(rows):
     optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=1e-2)
     loss = ClipPPOLoss(actor, critic, entropy_coeff=0.01, loss_critic_type="l2")
     update = PPOUpdate(loss, optimizer, epochs=3, minibatches=1, max_grad_norm=0.1,
-        divergence=lambda sample: sample["observation"].mean())
+        divergence=lambda sample: sample["observation"].mean(), groups=("skill", 3))
     metrics = update(experience(rows), torch.Generator().manual_seed(1))
     return torch.cat([p.detach().flatten() for p in distributed.optimized(optimizer)]), metrics["kl"]
 
@@ -54,9 +55,8 @@ with distributed.processes():
     value = torch.tensor([1.0, 2.0]) + 2.0 * rank
     assert distributed.total(value).tolist() == [4.0, 6.0] and value.tolist() == [1.0 + 2.0 * rank, 2.0 + 2.0 * rank]
     assert distributed.average(value).tolist() == [2.0, 3.0]
-    mean, deviation = distributed.moments(value)
-    every = torch.tensor([1.0, 2.0, 3.0, 4.0])
-    torch.testing.assert_close((mean, deviation), (every.mean(), every.std()))
+    mean, deviation = distributed.moments(value, torch.tensor([0, rank]), 2)  # of 1, 2 and 3; of 4 alone
+    torch.testing.assert_close((mean, deviation), (torch.tensor([2.0, 0.0]), torch.tensor([1.0, 1.0])))
     assert distributed.anyone(rank == 1) and not distributed.anyone(False)
     mine = {"a": 1.0, "b": math.nan, "c": 7.0} if rank else {"a": 0.0, "b": 4.0}
     found = distributed.average_metrics(mine)
@@ -102,7 +102,8 @@ def test_alone_everything_stays_what_it_is() -> None:
         assert (distributed.rank(), distributed.size()) == (0, 1)
     value = torch.randn(5)
     assert distributed.total(value) is value and distributed.average(value) is value
-    assert torch.equal(torch.stack(distributed.moments(value)), torch.stack((value.mean(), value.std())))
+    together = torch.stack(distributed.moments(value, torch.zeros(5, dtype=torch.int64), 1))[:, 0]
+    torch.testing.assert_close(together, torch.stack((value.mean(), value.std())))
     distributed.wait()
 
 

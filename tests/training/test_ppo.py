@@ -51,6 +51,25 @@ def test_advantages_are_normalised_over_the_batch() -> None:
     assert batch["advantage"].std().item() == pytest.approx(1.0, abs=1e-4)
 
 
+def test_advantages_are_normalised_within_each_group() -> None:
+    """However much a task pays, it is learned as much as the others; one that a batch holds once stays as it is."""
+    normalized = []
+    for factor in (1.0, 100.0):
+        actor, critic, update = build(groups=("task", 4))
+        batch = collect(actor, critic, torch.Generator().manual_seed(1))
+        batch["task"] = torch.arange(8 * 16).reshape(8, 16) % 2
+        batch["task"][0, 0] = 3
+        raw = torch.where(batch["task"] == 1, factor * batch["advantage"][..., 0] - 7.0, batch["advantage"][..., 0])
+        batch["advantage"] = raw[..., None].clone()
+        update(batch, torch.Generator().manual_seed(2))
+        for task in (0, 1):
+            own, before = batch["advantage"][batch["task"] == task], raw[batch["task"] == task]
+            torch.testing.assert_close(own[:, 0], (before - before.mean()) / before.std(), rtol=1e-4, atol=1e-5)
+        assert batch["advantage"][0, 0, 0] == raw[0, 0]  # alone: no deviation to divide by
+        normalized.append(batch["advantage"])
+    torch.testing.assert_close(*normalized, rtol=1e-3, atol=1e-4)
+
+
 def test_the_divergence_moves_the_learning_rate() -> None:
     actor, critic, update = build(divergence=lambda sample: torch.tensor(1.0))
     update.schedule = KLAdaptiveLR(update.optimizer, 0.01)
