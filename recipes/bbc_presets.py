@@ -20,13 +20,15 @@ PAPER = Config(
     ppo=PPOConfig(minibatches=4),
 )
 CPU = Config(
-    iterations=800,
+    iterations=850,
     max_minutes=58.0,
     changes=(
         (350, "ppo.entropy", 0.0005),
         (500, "ppo.desired_kl", 0.008),
         (500, "imitation.imitation_reward", 6.0),
         (500, "env.jump_weight", 28.0),
+        (600, "env.canter_stance", 0.04),
+        (600, "env.progress_left", 6.0),
     ),
     motion=MotionConfig(one_sided=("canter",), offsets=(0, 8, 16, 23, 24), standing_weight=0.0),
     env=EnvConfig(
@@ -86,7 +88,7 @@ CPU = Config(
         height_deviation=0.06,
     ),
     adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
-    trials=TrialsConfig(start=700),
+    trials=TrialsConfig(start=750),
 )
 POLISH = replace(
     CPU,
