@@ -75,9 +75,6 @@ class EnvConfig:
     """Weight of a reward for the stride frequency and the foot phases of the behaviour's labelled clips (ours)."""
     walk_growth: float = FREQUENCY_GROWTH["walk"]
     """Strides that a second shall hold more of for each m/s that the walk is commanded faster [1/m]."""
-    walk_slower: float = 0.0
-    """By how many strides a second fewer the walk is asked for [Hz] (ours): who swings in a purer sine than a dog is
-    forgiven 0.15 too many by the rhythm."""
     walk_emphasis: float = 1.0
     """How many times as much the walk's rhythm is paid as that of the other behaviours (ours): of the most that it can
     earn by it, ``pretrained/bbc`` earns 0.28 when it walks, 0.59 to 0.83 else."""
@@ -259,7 +256,7 @@ class Config(HardwareConfig):
 
 
 CHANGEABLE: tuple[str, ...] = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight", "env.progress_left")
-CHANGEABLE += ("env.standing_starts", "env.canter_stance", "env.walk_emphasis", "env.walk_slower")
+CHANGEABLE += ("env.standing_starts", "env.canter_stance", "env.walk_emphasis")
 CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
 """Options that may change during a run."""
 

@@ -20,15 +20,15 @@ PAPER = Config(
     ppo=PPOConfig(minibatches=4),
 )
 CPU = Config(
-    iterations=850,
+    iterations=1200,
     max_minutes=58.0,
     changes=(
         (350, "ppo.entropy", 0.0005),
         (500, "ppo.desired_kl", 0.008),
         (500, "imitation.imitation_reward", 6.0),
-        (500, "env.jump_weight", 28.0),
-        (600, "env.canter_stance", 0.04),
-        (600, "env.progress_left", 6.0),
+        (500, "env.jump_weight", 20.0),
+        (700, "env.canter_stance", 0.03),
+        (900, "env.jump_weight", 30.0),
     ),
     motion=MotionConfig(one_sided=("canter",), offsets=(0, 8, 16, 23, 24), standing_weight=0.0),
     env=EnvConfig(
@@ -43,10 +43,8 @@ CPU = Config(
         progress_left=4.0,
         rhythm_weight=20.0,
         walk_growth=0.8,
-        walk_slower=0.1,
         walk_emphasis=2.0,
-        canter_stance=0.06,
-        jump_weight=20.0,
+        jump_weight=16.0,
         jump_width=0.03,
     ),
     ppo=PPOConfig(
@@ -58,7 +56,6 @@ CPU = Config(
         gamma=0.98,
         entropy=0.002,
         precision="auto",
-        by_behaviour=True,
         averaging=0.96,
         initial_std=0.5,
         hidden=(256, 128, 64),
@@ -88,7 +85,7 @@ CPU = Config(
         height_deviation=0.06,
     ),
     adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
-    trials=TrialsConfig(start=750),
+    trials=TrialsConfig(start=1000),
 )
 POLISH = replace(
     CPU,
@@ -105,8 +102,7 @@ POLISH = replace(
         desired_kl=0.006,
         entropy=0.0005,
         critic_warm_up=20,
-        by_behaviour=False,  # what this preset made was made without, and without averaging
-        averaging=0.0,
+        averaging=0.0,  # what this preset made was made without
     ),
     imitation=replace(
         CPU.imitation,
@@ -124,9 +120,8 @@ QUICKSTART = replace(
     name="quickstart",
     iterations=110,
     max_minutes=5.0,
-    env=replace(CPU.env, num_robots=512, rhythm_weight=0.0, jump_weight=16.0),
-    # 110 iterations of fast learning are too few to average over 25; it was tuned before behaviours were told apart.
-    ppo=replace(CPU.ppo, by_behaviour=False, averaging=0.0),
+    env=replace(CPU.env, num_robots=512, rhythm_weight=0.0),
+    ppo=replace(CPU.ppo, averaging=0.0),  # 110 iterations of fast learning are too few to average over 25
     imitation=replace(CPU.imitation, cloning=500),
 )
 SMOKE = replace(

@@ -214,7 +214,6 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     parts.env.standing_starts = cfg.env.standing_starts
     if parts.env.rhythm is not None:
         parts.env.rhythm.longer_stance[BEHAVIOURS.index("canter")] = cfg.env.canter_stance
-        parts.env.rhythm.slower[BEHAVIOURS.index("walk")] = cfg.env.walk_slower
         parts.env.rhythm.emphasis[BEHAVIOURS.index("walk")] = cfg.env.walk_emphasis
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     parts.env.set_skill_probabilities(parts.prior.sampling_probabilities)

@@ -34,7 +34,7 @@ _REAL = ("power", "mean", "last", "stance", "fresh")
 class Rhythm:
     r"""Short memory of the fore-aft motion of the feet, and how much of it follows a dog's pattern.
 
-    A resonator at the behaviour's stride frequency :math:`f = f_0 - s + g\,(|v^*| - v_0)`, at least :math:`f_0 / 2`,
+    A resonator at the behaviour's stride frequency :math:`f = f_0 + g\,(|v^*| - v_0)`, at least :math:`f_0 / 2`,
     follows each foot's fore-aft position x about its mean,
 
     .. math:: \dot z_i = \left(2 \pi i f - \tfrac{f}{m}\right) z_i + \tfrac{f}{m}\,(x_i - \bar x_i),
@@ -60,7 +60,6 @@ class Rhythm:
 
     Attributes:
         longer_stance: l of each behaviour, ``[5]``; 0 unless set.
-        slower: s of each behaviour [Hz], ``[5]``; 0 unless set.
         emphasis: by what the agreement of each behaviour is multiplied, ``[5]``; 1 unless set.
 
     Example:
@@ -80,7 +79,6 @@ class Rhythm:
         device = patterns["frequency"].device
         self._figures = torch.stack([patterns[name] for name in _FIGURES], -1)  # [5, 5]
         self.longer_stance = torch.zeros(len(BEHAVIOURS), device=device)
-        self.slower = torch.zeros(len(BEHAVIOURS), device=device)
         self.emphasis = torch.ones(len(BEHAVIOURS), device=device)
         self._images = torch.stack([patterns[name] for name in ("phase", "mirrored_phase")], 1)  # [5, 2, 6]
         self._swing = torch.zeros(num_robots, 4, dtype=torch.complex64, device=device)
@@ -107,8 +105,7 @@ class Rhythm:
         ``forward`` ``[2, N]`` [m/s], now and on the mean, and is told to go at speeds ``[N]`` [m/s]."""
         usual, usual_speed, growth, duty, dogs_share = self._figures[skill].unbind(-1)
         duty = duty + self.longer_stance[skill]
-        asked = usual - self.slower[skill] + growth * (speed - usual_speed)
-        step = dt * torch.maximum(asked, 0.5 * usual)[:, None]
+        step = dt * torch.maximum(usual + growth * (speed - usual_speed), 0.5 * usual)[:, None]
         self._swing = self._swing.masked_fill(self._fresh, 0.0)
         self._power = self._power.masked_fill(self._fresh, 0.0)
         mean = torch.where(self._fresh, position, self._mean)

@@ -123,17 +123,6 @@ def test_feet_out_of_phase_lose_their_pairs() -> None:
     assert heard(late, 2.0, pattern) == pytest.approx((2.0 + 4.0 * lost) / 6.0 * heard(TROT, 2.0, pattern), abs=0.05)
 
 
-def test_a_behaviour_that_shall_be_slower_is_one_of_that_frequency() -> None:
-    slower, usual = Rhythm(2, pattern_of(TROT, 2.0)), Rhythm(2, pattern_of(TROT, 1.5))
-    slower.slower[0] = 0.5
-    skill, speed = torch.tensor([0, 2]), torch.ones(2)
-    for step in range(150):
-        swing = torch.cos(2.0 * math.pi * (1.5 * 0.02 * step + TROT)).expand(2, 4)
-        both = [memory.hear(swing, STANDING.expand(2, 2), skill, speed, 0.02) for memory in (slower, usual)]
-    torch.testing.assert_close(both[0][0], both[1][0])
-    assert both[0][1] < 0.8 * both[1][1]  # the other behaviour is asked for two strides a second as before
-
-
 def test_an_emphasis_multiplies_its_behaviour_alone() -> None:
     usual, louder = Rhythm(2, pattern_of(TROT, 2.0)), Rhythm(2, pattern_of(TROT, 2.0))
     louder.emphasis[0] = 2.5

@@ -33,7 +33,7 @@ EVERYTHING = (
     *("--imitation.information-ramp", "2", "4", "--adaptation.privileged-ramp", "3", "2", "--adaptation.every", "3"),
     *("--changes", "5", "ppo.entropy", "0.002", "6", "env.jump-weight", "9.0", "3", "env.standing-starts", "0.5"),
     *("6", "env.progress-left", "7.0", "5", "env.canter-stance", "0.1", "4", "env.walk-emphasis", "2.0"),
-    *("5", "env.walk-slower", "0.1", "--ppo.by-behaviour"),
+    "--ppo.by-behaviour",
 )
 """Whatever is random, and ramps and changes on both sides of the middle of eight iterations."""
 
