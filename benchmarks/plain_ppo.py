@@ -247,8 +247,7 @@ class Plain:
         flat = {name: batch[name].flatten(0, 1) for name in (*names, "estimate", "loc", "scale", "action", "log_prob")}
         flat["target"] = (advantage + batch["value"]).flatten()
         flat["advantage"], group = advantage.flatten(), batch[keys.SKILL].flatten() * ppo.by_behaviour
-        for index in group.unique():
-            own = group == index
+        for own in (group == index for index in group.unique()):
             deviation, mean = torch.std_mean(flat["advantage"][own])
             flat["advantage"][own] = (flat["advantage"][own] - mean) / (deviation + 1e-8)
         count = self.steps * self.n
