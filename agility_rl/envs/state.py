@@ -38,7 +38,7 @@ class LocomotionState:
         command: ``[N, 5]`` in the order of :data:`agility_rl.behaviours.COMMANDS`.
         jumping: bool ``[N]``, the skill is jump.
         peak_height: ``[N]`` highest trunk of the last 0.9 s [m].
-        rhythm: ``[N]`` how much of the feet's motion follows the commanded behaviour's pattern, by its emphasis (0: none).
+        rhythm: ``[N]`` how much of the feet's motion follows the commanded pattern, times its emphasis (0 without).
         unstable: bool ``[N]``, the engine reported divergence.
         dt: control step [s].
     """
