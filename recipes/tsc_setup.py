@@ -196,6 +196,7 @@ def make_env(
         randomization=COURSE_RANDOMIZATION if robots.randomize else None,
         episode_length=robots.episode_length,
         goal_radius=robots.goal_radius,
+        start=robots.start,
         start_spread=robots.start_spread,
         push_interval=robots.push_interval,
         **options,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,7 +16,7 @@ from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.agility_rewards import AGILITY_REWARDS, TERMINATION, TERMINATION_TERM, AgilityTerm
 from agility_rl.envs.agility_state import AgilityState
 from agility_rl.envs.agility_terminations import AGILITY_TERMINATIONS, Termination
-from agility_rl.envs.arena import NUM_PLACE, Arena
+from agility_rl.envs.arena import NUM_PLACE, Arena, Start
 from agility_rl.envs.course import Course
 from agility_rl.envs.course_presets import full_course
 from agility_rl.envs.decisions import COMMAND_NOISE, NUM_PARAMETERS, Decisions
@@ -76,7 +76,7 @@ class AgilityEnv(EnvBase):
         observation_noise: factor on the noise of the proprioception (the release has none here).
         episode_length: seconds until truncation.
         goal_radius: distance at which a way-point is reached [m].
-        start: before a random obstacle, or before the first.
+        start: before which obstacle, or after which (:class:`~agility_rl.envs.arena.Arena`).
         start_spread: how many times as far aside and turned as released (:class:`~agility_rl.envs.arena.Arena`).
         push_interval: seconds between pushes; ``None`` for none.
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
@@ -115,7 +115,7 @@ class AgilityEnv(EnvBase):
         observation_noise: float = 0.0,
         episode_length: float = 40.0,
         goal_radius: float = GOAL_RADIUS,
-        start: Literal["random", "first"] = "random",
+        start: Start = "random",
         start_spread: float = 1.0,
         push_interval: float | None = None,
         push_velocity: float = 0.5,

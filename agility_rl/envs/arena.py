@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDict
@@ -24,6 +24,9 @@ NUM_PLACE = 8
 """Numbers of ``keys.PLACE``."""
 START_BEHIND, START_ASIDE, START_TURN = 0.2, 0.1, 0.2
 """Draw of the start: 0 to 0.2 m behind the first way-point, +-0.1 m beside it, +-0.2 rad (method notes, 5.7)."""
+START_BEYOND = 0.5
+"""How far behind an obstacle it has been left [m]: nothing of a robot that starts there is in it (ours)."""
+Start = Literal["random", "first", "after"]
 
 
 class Arena:
@@ -36,7 +39,8 @@ class Arena:
         num_robots: N.
         generator: source of randomness; where it is, the tensors are.
         goal_radius: distance at which a way-point is reached [m].
-        start: before a random obstacle, or before the first.
+        start: before the ``first`` obstacle or a ``random`` one; ``after``: for a random one where the obstacle before
+            it is left, so that robots come to it as on the whole course (turned away from it in an S, say).
         start_spread: how many times as far aside and turned as released; 4 covers how robots leave the obstacle before.
 
     Attributes:
@@ -57,14 +61,14 @@ class Arena:
         num_robots: int,
         generator: torch.Generator,
         goal_radius: float = GOAL_RADIUS,
-        start: Literal["random", "first"] = "random",
+        start: Start = "random",
         start_spread: float = 1.0,
     ) -> None:
-        if start not in ("random", "first"):
-            raise ValueError(f"expected start 'random' or 'first', got {start!r}")
+        if start not in get_args(Start):
+            raise ValueError(f"expected start 'random', 'first' or 'after', got {start!r}")
         if not 0.0 <= start_spread <= 10.0:
             raise ValueError(f"start_spread must be from 0 to 10, got {start_spread}")
-        self.generator, self.random_start, self.start_spread = generator, start == "random", start_spread
+        self.generator, self.start, self.start_spread = generator, start, start_spread
         self.layout = CourseLayout(course, num_robots, generator)
         self.progress = CourseProgress(self.layout, goal_radius)
         self.scan = HeightScan(self.layout)
@@ -76,6 +80,9 @@ class Arena:
             torch.tensor([names.index(kind.name) for kind in kinds], device=device), len(names)
         ).bool()
         self._speeds = torch.tensor([kind.target_speed for kind in kinds], device=device)
+        ends = [slot.goals[-1] for slot in course.slots]
+        left = [(max(x, kind.half_extents[0] + START_BEYOND), y) for kind, (x, y) in zip(kinds, ends, strict=True)]
+        self._left = torch.tensor(left, device=device)
 
     def set_curriculum(self, difficulty: float | None, obstacles: int | None, start_weights: Tensor | None) -> None:
         """Change what later episodes draw; what is ``None`` stays as it is.
@@ -104,7 +111,7 @@ class Arena:
         simulator.place(mask, *self.layout.poses())
         length = self.layout.length
         leg = torch.zeros(n, dtype=torch.int64, device=device)
-        if self.random_start:
+        if self.start != "first":
             valid = torch.arange(self.layout.route.shape[1], device=device) < length[:, None]
             weights = self.start_weights[self.layout.route] * valid
             leg = torch.multinomial(weights, 1, generator=self.generator)[:, 0]
@@ -113,8 +120,8 @@ class Arena:
         behind, aside, turn = torch.rand(3, n, generator=self.generator, device=device)
         spread = self.start_spread
         shift = torch.stack((-START_BEHIND * behind, spread * START_ASIDE * (2.0 * aside - 1.0)), -1)
-        obstacle = self.progress.obstacle
-        place = self.layout.world(obstacle, self.progress.local_goal() + shift)
+        obstacle, local = self._stand(leg)
+        place = self.layout.world(obstacle, local + shift)
         yaw = self.layout.yaw.gather(1, obstacle[:, None])[:, 0] + spread * START_TURN * (2.0 * turn - 1.0)
         height = self.ground(place, simulator)[:, None] + constants.STANDING_HEIGHT + CLEARANCE
         level, still = torch.zeros_like(yaw), torch.zeros(n, 3, device=device)
@@ -128,6 +135,15 @@ class Arena:
             joint_velocity=torch.zeros(n, constants.NUM_JOINTS, device=device),
         )
         self.progress.locate(mask, place)
+
+    def _stand(self, leg: Tensor) -> tuple[Tensor, Tensor]:
+        """Obstacle by which the robots of legs ``[N]`` start, and where in its frame, int64 ``[N]`` and ``[N, 2]``."""
+        ahead, first = self.progress.obstacle, self.progress.local_goal()
+        if self.start != "after":
+            return ahead, first
+        behind = self.layout.route.gather(1, (leg - 1).clamp(min=0)[:, None])[:, 0]
+        on_the_way = leg > 0
+        return torch.where(on_the_way, behind, ahead), torch.where(on_the_way[:, None], self._left[behind], first)
 
     def ground(self, position: Tensor, simulator: Simulator) -> Tensor:
         """Height [m] of what robots stand on under horizontal positions ``[N, 2]``, as ``[N]``."""

@@ -57,8 +57,32 @@ def test_a_start_before_the_first() -> None:
     arena, simulator = build(start="first")
     begin(arena, simulator)
     assert (arena.progress.leg == 0).all()
-    with pytest.raises(ValueError, match="'random' or 'first', got 'last'"):
+    with pytest.raises(ValueError, match="'random', 'first' or 'after', got 'last'"):
         build(start="last")
+
+
+def test_a_start_where_the_obstacle_before_is_left() -> None:
+    arena, simulator = build(n=400, start="after")
+    begin(arena, simulator)
+    rows, leg = torch.arange(400), arena.progress.leg
+    later = leg > 0
+    behind = arena.layout.route[rows, leg - 1]
+    # Half a metre behind A-frame (1.46 m), poles (1.61) and seesaw (1.5), or at the last way-point.
+    ends = {"bar_jump": 0.9, "a_frame": 1.9625, "weave_poles": 2.11, "seesaw": 2.0, "tire_jump": 0.9, "tunnel": 1.525}
+    end = torch.tensor([(ends[kind.name], 0.5 if kind.name == "weave_poles" else 0.0) for kind in arena.layout.kinds])
+    short = end[behind] - arena.layout.local_to(behind, simulator.root_position[:, :2])
+    assert short[later, 0].min() >= -1e-5 and short[later, 0].max() <= 0.2 + 1e-5
+    assert short[later, 1].abs().max() <= 0.1 + 1e-5
+    yaw = rotations.to_euler(simulator.root_quaternion)[2]
+    along = rotations.wrap_angle(yaw - arena.layout.yaw[rows, behind])
+    assert along[later].abs().max() <= 0.2 + 1e-5
+    # The way turns back behind the second and the fourth obstacle: there robots look away from what comes.
+    turn = rotations.wrap_angle(yaw - arena.layout.yaw[rows, arena.progress.obstacle]).abs()
+    back = (leg == 2) | (leg == 4)
+    assert turn[back].min() > 2.5 and turn[~back].max() < 0.6
+    first = (arena.progress.local - arena.progress.local_goal())[~later]
+    assert first[:, 0].min() >= -0.2 - 1e-5 and first[:, 1].abs().max() <= 0.1 + 1e-5
+    assert (simulator.contact_force[:, :1] == 0.0).all()  # nobody starts inside something
 
 
 def test_curriculum() -> None:
