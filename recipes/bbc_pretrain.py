@@ -169,6 +169,9 @@ def speed_share(parts: Components, batch: TensorDictBase) -> Tensor:
 
 def begin(parts: Components, cfg: Config) -> None:
     """Where a new run starts from: labels for Q^c, and another run's policy or the labelled clips."""
+    if cfg.changes:  # a preset's too, which then hold instead of what the command line asked for
+        later = ", ".join(f"{option} {value:g} from {start}" for start, option, value in cfg.changes)
+        print(f"changes during the run (--changes): {later}")
     warm_up_predictor(parts, cfg.imitation)
     if cfg.init_from:
         Artifact.load(cfg.init_from, kind="bbc").fill(parts.bbc)

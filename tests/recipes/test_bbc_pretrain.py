@@ -70,7 +70,8 @@ def test_smoke_run_writes_everything_the_next_stage_needs(finished: Path) -> Non
 
 
 def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished: Path) -> None:
-    run(finished, "--name", "halves", "--iterations", "4", *EVERYTHING)
+    told = run(finished, "--name", "halves", "--iterations", "4", *EVERYTHING).stdout
+    assert "changes during the run (--changes): ppo.entropy 0.002 from 5, env.jump-weight 9 from 6" in told
     run(finished, "--resume", str(finished / "halves"), "--iterations", "8")
     whole, halves = (Artifact.load(finished / name / "policy").state for name in ("whole", "halves"))
     assert whole.keys() == halves.keys()
