@@ -12,7 +12,6 @@ from typing import Literal
 from hardware import HardwareConfig
 
 from agility_rl.envs.agility_rewards import TERMINATION
-from agility_rl.envs.arena import Start
 from agility_rl.training.precision import Precision
 
 
@@ -27,11 +26,11 @@ class RobotsConfig:
     """Factors on every command (method notes, section 5.1)."""
     episode_length: float = 40.0
     """Seconds (method notes, section 5.6)."""
-    start: Start = "random"
-    """Before a ``random`` obstacle, as released, or where the one before it is left (``after``, ours)."""
     start_spread: float = 1.0
     """Times as far aside and turned as released (0.1 m, 0.2 rad) that robots start; more covers how they leave an
     obstacle for the next (ours)."""
+    start_after: float = 0.0
+    """Share of the episodes that start where the obstacle before is left, instead of straight before one (ours)."""
     goal_radius: float = 0.4
     """Distance at which a way-point is reached [m]: 0.4 for teachers, 0.45 for students and in the evaluation (method
     notes, section 5.5)."""

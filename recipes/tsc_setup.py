@@ -196,8 +196,8 @@ def make_env(
         randomization=COURSE_RANDOMIZATION if robots.randomize else None,
         episode_length=robots.episode_length,
         goal_radius=robots.goal_radius,
-        start=robots.start,
         start_spread=robots.start_spread,
+        start_after=robots.start_after,
         push_interval=robots.push_interval,
         **options,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,7 +16,7 @@ from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.agility_rewards import AGILITY_REWARDS, TERMINATION, TERMINATION_TERM, AgilityTerm
 from agility_rl.envs.agility_state import AgilityState
 from agility_rl.envs.agility_terminations import AGILITY_TERMINATIONS, Termination
-from agility_rl.envs.arena import NUM_PLACE, Arena, Start
+from agility_rl.envs.arena import NUM_PLACE, Arena
 from agility_rl.envs.course import Course
 from agility_rl.envs.course_presets import full_course
 from agility_rl.envs.decisions import COMMAND_NOISE, NUM_PARAMETERS, Decisions
@@ -76,8 +76,9 @@ class AgilityEnv(EnvBase):
         observation_noise: factor on the noise of the proprioception (the release has none here).
         episode_length: seconds until truncation.
         goal_radius: distance at which a way-point is reached [m].
-        start: before which obstacle, or after which (:class:`~agility_rl.envs.arena.Arena`).
+        start: before a random obstacle, or before the first.
         start_spread: how many times as far aside and turned as released (:class:`~agility_rl.envs.arena.Arena`).
+        start_after: share of the episodes that start where the obstacle before is left.
         push_interval: seconds between pushes; ``None`` for none.
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
         motion_offsets: which discriminator frames ``motion`` holds, in control steps from the oldest.
@@ -115,8 +116,9 @@ class AgilityEnv(EnvBase):
         observation_noise: float = 0.0,
         episode_length: float = 40.0,
         goal_radius: float = GOAL_RADIUS,
-        start: Start = "random",
+        start: Literal["random", "first"] = "random",
         start_spread: float = 1.0,
+        start_after: float = 0.0,
         push_interval: float | None = None,
         push_velocity: float = 0.5,
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
@@ -132,7 +134,7 @@ class AgilityEnv(EnvBase):
         self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
         self.simulator = simulator
         self.generator = torch.Generator(simulator.device).manual_seed(seed)
-        self.arena = Arena(course, num_robots, self.generator, goal_radius, start, start_spread)
+        self.arena = Arena(course, num_robots, self.generator, goal_radius, start, start_spread, start_after)
         if self.simulator.num_simulations != num_robots:
             raise ValueError(f"the simulator holds {self.simulator.num_simulations} robots, expected {num_robots}")
         if tuple(self.simulator.scenery) != pieces:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict
@@ -26,7 +26,6 @@ START_BEHIND, START_ASIDE, START_TURN = 0.2, 0.1, 0.2
 """Draw of the start: 0 to 0.2 m behind the first way-point, +-0.1 m beside it, +-0.2 rad (method notes, 5.7)."""
 START_BEYOND = 0.5
 """How far behind an obstacle it has been left [m]: nothing of a robot that starts there is in it (ours)."""
-Start = Literal["random", "first", "after"]
 
 
 class Arena:
@@ -39,8 +38,9 @@ class Arena:
         num_robots: N.
         generator: source of randomness; where it is, the tensors are.
         goal_radius: distance at which a way-point is reached [m].
-        start: before the ``first`` obstacle or a ``random`` one; ``after``: for a random one where the obstacle before
-            it is left, so that robots come to it as on the whole course (turned away from it in an S, say).
+        start: before a random obstacle, or before the first.
+        start_after: share of the episodes which start where the obstacle before is left, so that robots come to the
+            next as on the whole course (turned away from it in an S, say), and not straight from a stand before it.
         start_spread: how many times as far aside and turned as released; 4 covers how robots leave the obstacle before.
 
     Attributes:
@@ -52,7 +52,7 @@ class Arena:
         types: bool ``[K, 7]``, one-hot type of each obstacle.
 
     Raises:
-        ValueError: if ``start`` is something else, or ``start_spread`` out of its range.
+        ValueError: if ``start`` is something else, or ``start_spread`` or ``start_after`` out of its range.
     """
 
     def __init__(
@@ -61,14 +61,18 @@ class Arena:
         num_robots: int,
         generator: torch.Generator,
         goal_radius: float = GOAL_RADIUS,
-        start: Start = "random",
+        start: Literal["random", "first"] = "random",
         start_spread: float = 1.0,
+        start_after: float = 0.0,
     ) -> None:
-        if start not in get_args(Start):
-            raise ValueError(f"expected start 'random', 'first' or 'after', got {start!r}")
+        if start not in ("random", "first"):
+            raise ValueError(f"expected start 'random' or 'first', got {start!r}")
+        if not 0.0 <= start_after <= 1.0:
+            raise ValueError(f"start_after must be a share from 0 to 1, got {start_after}")
         if not 0.0 <= start_spread <= 10.0:
             raise ValueError(f"start_spread must be from 0 to 10, got {start_spread}")
-        self.generator, self.start, self.start_spread = generator, start, start_spread
+        self.generator, self.random_start, self.start_spread = generator, start == "random", start_spread
+        self.start_after = start_after
         self.layout = CourseLayout(course, num_robots, generator)
         self.progress = CourseProgress(self.layout, goal_radius)
         self.scan = HeightScan(self.layout)
@@ -111,7 +115,7 @@ class Arena:
         simulator.place(mask, *self.layout.poses())
         length = self.layout.length
         leg = torch.zeros(n, dtype=torch.int64, device=device)
-        if self.start != "first":
+        if self.random_start:
             valid = torch.arange(self.layout.route.shape[1], device=device) < length[:, None]
             weights = self.start_weights[self.layout.route] * valid
             leg = torch.multinomial(weights, 1, generator=self.generator)[:, 0]
@@ -139,10 +143,11 @@ class Arena:
     def _stand(self, leg: Tensor) -> tuple[Tensor, Tensor]:
         """Obstacle by which the robots of legs ``[N]`` start, and where in its frame, int64 ``[N]`` and ``[N, 2]``."""
         ahead, first = self.progress.obstacle, self.progress.local_goal()
-        if self.start != "after":
+        if self.start_after == 0.0:
             return ahead, first
         behind = self.layout.route.gather(1, (leg - 1).clamp(min=0)[:, None])[:, 0]
-        on_the_way = leg > 0
+        chosen = torch.rand(len(leg), generator=self.generator, device=leg.device) < self.start_after
+        on_the_way = (leg > 0) & chosen
         return torch.where(on_the_way, behind, ahead), torch.where(on_the_way[:, None], self._left[behind], first)
 
     def ground(self, position: Tensor, simulator: Simulator) -> Tensor:

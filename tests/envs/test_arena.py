@@ -57,12 +57,12 @@ def test_a_start_before_the_first() -> None:
     arena, simulator = build(start="first")
     begin(arena, simulator)
     assert (arena.progress.leg == 0).all()
-    with pytest.raises(ValueError, match="'random', 'first' or 'after', got 'last'"):
+    with pytest.raises(ValueError, match="'random' or 'first', got 'last'"):
         build(start="last")
 
 
 def test_a_start_where_the_obstacle_before_is_left() -> None:
-    arena, simulator = build(n=400, start="after")
+    arena, simulator = build(n=400, start_after=1.0)
     begin(arena, simulator)
     rows, leg = torch.arange(400), arena.progress.leg
     later = leg > 0
@@ -83,6 +83,15 @@ def test_a_start_where_the_obstacle_before_is_left() -> None:
     first = (arena.progress.local - arena.progress.local_goal())[~later]
     assert first[:, 0].min() >= -0.2 - 1e-5 and first[:, 1].abs().max() <= 0.1 + 1e-5
     assert (simulator.contact_force[:, :1] == 0.0).all()  # nobody starts inside something
+
+    half, simulator = build(n=400, start_after=0.5)
+    begin(half, simulator)
+    yaw = rotations.to_euler(simulator.root_quaternion)[2]
+    turn = rotations.wrap_angle(yaw - half.layout.yaw[rows, half.progress.obstacle]).abs()
+    back = (half.progress.leg == 2) | (half.progress.leg == 4)
+    assert 0.3 < (turn[back] > 2.5).float().mean() < 0.7
+    with pytest.raises(ValueError, match=r"start_after must be a share from 0 to 1, got 1\.5"):
+        build(start_after=1.5)
 
 
 def test_curriculum() -> None:

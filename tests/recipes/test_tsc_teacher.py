@@ -100,11 +100,11 @@ def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
 
 
 def test_options_of_the_course_reach_it(recipe: ModuleType, smoke: Any) -> None:
-    env = replace(smoke.env, goal_radius=0.45, start="after", start_spread=2.0)
+    env = replace(smoke.env, goal_radius=0.45, start_spread=2.0, start_after=0.5)
     reward = replace(smoke.reward, termination=-500.0, heading=0.25)
     parts = recipe.build(replace(smoke, env=env, reward=reward, ppo=replace(smoke.ppo, bounds=0.25)))
     assert parts.env.arena.progress.radius == 0.45
-    assert (parts.env.arena.start, parts.env.arena.start_spread) == ("after", 2.0)
+    assert (parts.env.arena.start_spread, parts.env.arena.start_after) == (2.0, 0.5)
     assert parts.ppo.loss.bounds_coeff == 0.25 and "loss_bounds" in parts.ppo.loss.out_keys
     assert parts.env.termination_reward == -500.0 and parts.env.rewards["heading"].weight == 0.25
     parts.env.close()
