@@ -78,7 +78,7 @@ class AgilityEnv(EnvBase):
         goal_radius: distance at which a way-point is reached [m].
         start: before a random obstacle, or before the first.
         start_spread: how many times as far aside and turned as released (:class:`~agility_rl.envs.arena.Arena`).
-        start_after: share of the episodes that start where the obstacle before is left.
+        start_after: share of random starts that are where the obstacle before is left.
         push_interval: seconds between pushes; ``None`` for none.
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
         motion_offsets: which discriminator frames ``motion`` holds, in control steps from the oldest.

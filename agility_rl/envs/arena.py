@@ -39,7 +39,7 @@ class Arena:
         generator: source of randomness; where it is, the tensors are.
         goal_radius: distance at which a way-point is reached [m].
         start: before a random obstacle, or before the first.
-        start_after: share of the episodes which start where the obstacle before is left, so that robots come to the
+        start_after: share of random starts that are where the obstacle before is left, so that robots come to the
             next as on the whole course (turned away from it in an S, say), and not straight from a stand before it.
         start_spread: how many times as far aside and turned as released; 4 covers how robots leave the obstacle before.
 
