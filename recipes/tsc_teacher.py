@@ -62,6 +62,12 @@ def add_rewards(parts: Components, cfg: Config, batch: TensorDictBase) -> dict[s
     return {f"reward/{name}": value.mean() for name, value in rewards.items()}
 
 
+def value_finished(batch: TensorDictBase, value: float | None) -> None:
+    """Bootstrap finished courses by ``value`` in place of what the critic makes of states that it never sees."""
+    if value is not None:
+        batch["next", "state_value"].masked_fill_(batch["next", keys.OUTCOME, "finished"], value)
+
+
 def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     """One iteration of Algorithm S3's first loop; returns metrics by name."""
     lap = Laps()
@@ -72,6 +78,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     lap("collect")
     metrics: dict[str, Any] = judge(parts.env, parts.curriculum, batch)
     metrics |= add_rewards(parts, cfg, batch)
+    value_finished(batch, cfg.reward.finished)
     weight = functional.linear_ramp(iteration, *cfg.adaptation.privileged_ramp, cfg.adaptation.privileged)
     parts.privileged_loss.privileged = weight  # the loss applies its own coefficient
     if not with_history:

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.envs.obstacles import OBSTACLES
@@ -55,6 +56,16 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smok
     assert read_scalars(whole)["kl_continuous"][1][0].abs() < 1e-3, "the first iteration leaves the policy as it is"
     for name in ("reward/task", "loss_critic", "use/jump"):
         assert torch.equal(read_scalars(whole)[name][1], read_scalars(halves)[name][1]), name
+
+
+def test_a_finished_course_is_worth_what_the_option_says(recipe: ModuleType) -> None:
+    finished = torch.tensor([[[True], [False]], [[False], [False]]])
+    values = torch.tensor([[[46.0], [9.0]], [[0.0], [8.0]]])
+    batch = TensorDict({"next": {"state_value": values.clone(), "outcome": {"finished": finished}}}, [2, 2])
+    recipe.value_finished(batch, None)
+    assert torch.equal(batch["next", "state_value"], values)
+    recipe.value_finished(batch, 12.0)
+    assert batch["next", "state_value"].flatten().tolist() == [12.0, 9.0, 0.0, 8.0]
 
 
 def test_a_teacher_learns_to_read_its_place_from_where_it_was(recipe: ModuleType, smoke: Any) -> None:
