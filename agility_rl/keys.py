@@ -101,6 +101,9 @@ HIDDEN = "hidden"
 HEADING_ESTIMATE = "heading_estimate"
 """float32 ``[*B, 2]``, the student's guess of :data:`HEADING_ERROR` [rad]."""
 
+PLACE_ESTIMATE = "place_estimate"
+"""float32 ``[*B, 8]``, the student's guess of :data:`PLACE`, where its teacher reads that."""
+
 OBSTACLE_LOGITS = "obstacle_logits"
 """float32 ``[*B, 7]``, the student's unnormalised log-probabilities of :data:`OBSTACLE`."""
 

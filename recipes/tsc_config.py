@@ -77,6 +77,9 @@ class PPOConfig:
     """Of the hidden layers in the update; ``auto`` is bfloat16 on hardware that multiplies in it."""
     compile: bool = False
     """Fuse PPO's loss by ``torch.compile``: a minute once, then a faster update (docs/gpu.md)."""
+    averaging: float = 0.0
+    """What is saved is a moving average of the teacher's weights with this decay an iteration; 0: the last weights
+    (ours)."""
     initial_std: float = 1.0
     """At the start; a teacher of ``--init-from`` that has more begins with this."""
     min_std: float = 0.1

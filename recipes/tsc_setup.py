@@ -14,6 +14,7 @@ from held_fixed import INFERRED, privileged_loss
 from rollouts import Controller, load_controller
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import KLAdaptiveLR
 from torchrl.objectives.value import GAE
@@ -51,6 +52,7 @@ class Components:
     seeds: Seeds
     env: AgilityEnv
     teacher: Teacher
+    averaged: AveragedModel | None
     critic: Critic
     discriminator: Discriminator | None
     curriculum: Curriculum
@@ -72,7 +74,8 @@ class Components:
     @property
     def alike(self) -> dict[str, Any]:
         """What every process holds alike; what is frozen comes from its own artifact."""
-        names = ("teacher", "critic", "curriculum", "policy_optimizer", "adaptation_optimizer")
+        names = ["teacher", "critic", "curriculum", "policy_optimizer", "adaptation_optimizer"]
+        names += ["averaged"] if self.averaged is not None else []
         return {name: getattr(self, name) for name in names}
 
     @property
@@ -142,6 +145,7 @@ def build(cfg: Config) -> Components:
         seeds=seeds,
         env=env,
         teacher=teacher,
+        averaged=AveragedModel(teacher, multi_avg_fn=get_ema_multi_avg_fn(ppo.averaging)) if ppo.averaging else None,
         critic=critic,
         discriminator=None if discriminator is None else discriminator.to(device),
         curriculum=Curriculum.start(cfg.curriculum, env),
@@ -267,4 +271,7 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     manifest["network"] = parts.teacher.settings
     manifest["bbc"] = parts.bbc.artifact.manifest["weights"]["sha256"]
     manifest["course"] = cfg.env.course
-    Artifact.save(folder / "policy", parts.teacher.state_dict(), manifest)
+    shown: torch.nn.Module = parts.teacher
+    if parts.averaged is not None and parts.averaged.n_averaged > 0:
+        shown = parts.averaged.module
+    Artifact.save(folder / "policy", shown.state_dict(), manifest)

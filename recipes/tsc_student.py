@@ -44,8 +44,8 @@ from agility_rl.training import cli, distributed
 from agility_rl.training.seeding import permutation
 
 HEADLINE: tuple[str, ...] = ("time/minutes", "success", "episodes", "falls_per_minute")
-HEADLINE += ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_byol", "spread")
-HEADLINE += ("accuracy_behaviour", "accuracy_obstacle", "error_heading")
+HEADLINE += ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_place", "loss_byol", "spread")
+HEADLINE += ("accuracy_behaviour", "accuracy_obstacle", "error_heading", "error_place")
 HEADLINE += tuple(f"success/{name}" for name in OBSTACLES)
 
 

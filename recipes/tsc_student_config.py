@@ -72,6 +72,8 @@ class ImitationConfig:
     heading: float = 1.0
     obstacle: float = 1.0
     """Coefficients of the four terms of Eq. (15): all 1 (method notes, section 5.9)."""
+    place: float = 0.25
+    """Coefficient of the place, for students of a teacher that reads it (ours)."""
     heading_weights: tuple[float, float] = (2.0, 0.5)
     """Of the errors to the current and the next way-point (method notes, section 5.9)."""
     compared: Literal["all", "selected"] = "all"

@@ -124,7 +124,7 @@ def build(cfg: Config, trained: Trained) -> Components:
     # A tenth to a third less time for the convolutions on a CPU.
     student.depth_encoder.to(memory_format=torch.channels_last)
     student.depth_encoder.module.precision = hidden_precision(cfg.precision, device)
-    imitation = cfg.imitation
+    imitation, place = cfg.imitation, cfg.imitation.place if teacher.settings["num_place"] else None
     return Components(
         seeds=seeds,
         env=env,
@@ -138,6 +138,7 @@ def build(cfg: Config, trained: Trained) -> Components:
             imitation.steps,
             initial_hidden=student.initial_hidden(env.num_robots),
             bits=cfg.bits,
+            keep=(keys.HEADING_ERROR, keys.OBSTACLE, *([] if place is None else [keys.PLACE])),
             keep_next=("reward", keys.OUTCOME, keys.TERMINATIONS),
         ),
         curriculum=Curriculum.start(cfg.curriculum, env),
@@ -148,6 +149,7 @@ def build(cfg: Config, trained: Trained) -> Components:
             continuous=imitation.continuous,
             heading=imitation.heading,
             obstacle=imitation.obstacle,
+            place=place,
             compared=imitation.compared,
             heading_weights=imitation.heading_weights,
         ),

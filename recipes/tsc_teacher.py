@@ -95,6 +95,8 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     optimizer, minibatches = parts.adaptation_optimizer, cfg.adaptation.minibatches
     metrics |= fit((parts.adaptation_loss,), optimizer, batch, minibatches, parts.generator)
     lap("adaptation")
+    if parts.averaged is not None:
+        parts.averaged.update_parameters(parts.teacher)
     metrics |= {f"task/{name}": value.mean() for name, value in batch["next", keys.REWARD_TERMS].items()}
     metrics["std"] = parts.teacher.actor.network.parameters_head.std.detach().mean()
     return {name: float(value) for name, value in metrics.items()} | lap.metrics

@@ -16,7 +16,7 @@ from agility_rl.deploy.depth import DepthPreprocessor, DepthSource
 from agility_rl.deploy.onnx import onnx_session
 from agility_rl.go2 import camera, features
 from agility_rl.modules import RecurrentStudent
-from agility_rl.modules.student import HEADING_SCALE, PERCEIVED_HEADING, PERCEIVED_OBSTACLE
+from agility_rl.modules.student import HEADING_SCALE, PERCEIVED_HEADING, PERCEIVED_OBSTACLE, PERCEIVED_PLACE
 
 StudentNet = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
 """Depth [1, 58, 87], proprioception [1, 45], history [1, 10, 45] and memory [1, H] to logits [1, 5], parameters
@@ -60,12 +60,13 @@ class StudentNetwork(nn.Module):
         """Logits, parameters, heading errors [rad], obstacle logits, memory."""
         fused = self.memory.fusion(torch.cat((self.encoder(depth), proprioception), -1))
         _, after = self.memory.cell(fused[None], hidden[None])
-        latent, heading, obstacle = self.memory.head(after[0]).split(self.memory.sizes, -1)
+        latent, heading, obstacle, place = self.memory.head(after[0]).split(self.memory.sizes, -1)
         heading = HEADING_SCALE * heading
         inputs = {
             keys.PROPRIOCEPTION: proprioception,
             PERCEIVED_HEADING: heading,
             PERCEIVED_OBSTACLE: nn.functional.one_hot(obstacle.argmax(-1), obstacle.shape[-1]).to(obstacle.dtype),
+            PERCEIVED_PLACE: place,
             keys.TERRAIN_LATENT: latent.tanh(),
             keys.ESTIMATE: self.estimator(proprioception),
             keys.LATENT: self.history_encoder(history),

@@ -19,22 +19,25 @@ from agility_rl.keys import (
     OBSTACLE,
     OBSTACLE_LOGITS,
     PARAMETERS,
+    PLACE,
+    PLACE_ESTIMATE,
 )
 from agility_rl.losses.keyed import KeyedLoss, parameter_device
 
 
 class StudentLoss(KeyedLoss):
-    r"""Imitate a teacher's hybrid action, and predict the heading errors and the type of the obstacle.
+    r"""Imitate a teacher's hybrid action, and predict the heading errors, the obstacle's type and, if asked, the place.
 
     .. math:: L = w_D \, \mathrm{CE}(\ell, a^D_T) + w_C \, E \| a^C_T - \mu \|_2
               + w_\psi \, E \| \mathrm{diag}(2, \tfrac12) (\Delta\psi - \widehat{\Delta\psi}) \|_2
-              + w_o \, \mathrm{CE}(\ell_o, o)
+              + w_o \, \mathrm{CE}(\ell_o, o) + w_p \, E \| p - \hat p \|_1
 
     All coefficients are already applied to the losses returned. For a recurrent student give the policy that unrolls
     sequences, ``student.policy(assisted=True, sequence=True)``.
 
     Source: Eq. (15); form, norms and weights of the headings: released code (method notes, section 5.9). Different:
-    cross-entropy of the obstacle on logits, not on probabilities; differences of headings are wrapped to (-pi, pi].
+    cross-entropy of the obstacle on logits, not on probabilities; differences of headings are wrapped to (-pi, pi]; the
+    last term (ours) is for students of teachers that read their place.
 
     Keys read:
         every entry of ``network.in_keys``
@@ -42,10 +45,12 @@ class StudentLoss(KeyedLoss):
         (label, parameters)  float32 ``[*B, K, P]``   its parameters, of all choices
         heading_error        float32 ``[*B, 2]`` [rad]
         obstacle             float32 ``[*B, O]``, one-hot
+        place                float32 ``[*B, 8]``      with a coefficient of the place
     Keys written (``[]`` each; losses ``[*B]`` with ``reduction="none"``):
-        loss_behaviour, loss_parameters, loss_heading, loss_obstacle  only those with a coefficient
+        loss_behaviour, loss_parameters, loss_heading, loss_obstacle, loss_place  only those with a coefficient
         accuracy_behaviour, accuracy_obstacle  share that agrees, detached
         error_heading                          mean absolute error to the current way-point [rad], detached
+        error_place                            mean absolute error of the current way-point's x and y [m], detached
 
     Args:
         network: writes logits ``[*B, K]``, mean parameters ``[*B, K, P]``, heading estimates ``[*B, 2]`` and obstacle
@@ -54,6 +59,7 @@ class StudentLoss(KeyedLoss):
         continuous: coefficient of the parameters; schedulable.
         heading: coefficient of the headings; schedulable.
         obstacle: coefficient of the obstacle; schedulable.
+        place: coefficient of the place; schedulable. The network then writes place estimates ``[*B, 8]`` too.
         compared: parameters of ``"all"`` choices, as released, or of the one that the teacher ``"selected"``.
         heading_weights: of the errors to the current and the next way-point.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
@@ -81,27 +87,31 @@ class StudentLoss(KeyedLoss):
             loc (NestedKey): what the network writes, ``[*B, K, P]``.
             heading_estimate (NestedKey): what the network writes, ``[*B, 2]``.
             obstacle_logits (NestedKey): what the network writes, ``[*B, O]``.
+            place_estimate (NestedKey): what the network writes, ``[*B, 8]``.
             behaviour (NestedKey): the teacher's choice.
             parameters (NestedKey): the teacher's parameters.
             heading_error (NestedKey): true heading errors.
             obstacle (NestedKey): true obstacle, one-hot.
+            place (NestedKey): true place.
         """
 
         logits: NestedKey = "logits"
         loc: NestedKey = "loc"
         heading_estimate: NestedKey = HEADING_ESTIMATE
         obstacle_logits: NestedKey = OBSTACLE_LOGITS
+        place_estimate: NestedKey = PLACE_ESTIMATE
         behaviour: NestedKey = (LABEL, BEHAVIOUR)
         parameters: NestedKey = (LABEL, PARAMETERS)
         heading_error: NestedKey = HEADING_ERROR
         obstacle: NestedKey = OBSTACLE
+        place: NestedKey = PLACE
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     network: TensorDictModule
     network_params: TensorDictParams
     target_network_params: TensorDictParams
-    _schedulable_buffers = frozenset({"behaviour", "continuous", "heading", "obstacle"})
+    _schedulable_buffers = frozenset({"behaviour", "continuous", "heading", "obstacle", "place"})
 
     def __init__(
         self,
@@ -111,12 +121,14 @@ class StudentLoss(KeyedLoss):
         continuous: float | None = 1.0,
         heading: float | None = 1.0,
         obstacle: float | None = 1.0,
+        place: float | None = None,
         compared: Literal["all", "selected"] = "all",
         heading_weights: tuple[float, float] = (2.0, 0.5),
         reduction: str | None = None,
     ) -> None:
         super().__init__()
         coefficients = {"behaviour": behaviour, "continuous": continuous, "heading": heading, "obstacle": obstacle}
+        coefficients["place"] = place
         if all(value is None for value in coefficients.values()):
             raise ValueError(f"at least one of {', '.join(coefficients)} must be a number, got none")
         if compared not in ("all", "selected"):
@@ -140,6 +152,7 @@ class StudentLoss(KeyedLoss):
             (self.continuous, keys.parameters),
             (self.heading, keys.heading_error),
             (self.obstacle, keys.obstacle),
+            (self.place, keys.place),
         ):
             if coefficient is not None:
                 targets.append(key)
@@ -158,6 +171,8 @@ class StudentLoss(KeyedLoss):
             names += ["loss_heading", "error_heading"]
         if self.obstacle is not None:
             names += ["loss_obstacle", "accuracy_obstacle"]
+        if self.place is not None:
+            names += ["loss_place", "error_place"]
         return names
 
     @dispatch(auto_batch_size=False)
@@ -188,6 +203,10 @@ class StudentLoss(KeyedLoss):
             error = _cross_entropy(logits, kind)
             out.set("loss_obstacle", self.obstacle * self._reduce_loss(error, tensordict))
             out.set("accuracy_obstacle", (logits.detach().argmax(-1) == kind).float().mean())
+        if self.place is not None:
+            distance = (tensordict.get(keys.place).detach() - written.get(keys.place_estimate)).abs()
+            out.set("loss_place", self.place * self._reduce_loss(distance.sum(-1), tensordict))
+            out.set("error_place", distance.detach()[..., :2].mean())
         self._clear_weakrefs(tensordict, out, "network_params", "target_network_params")
         return out
 

@@ -20,7 +20,7 @@ from agility_rl.modules.estimator import StateEstimator
 from agility_rl.modules.hybrid_actor import HybridActor
 from agility_rl.modules.mlp import mlp
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
-from agility_rl.modules.teacher import NUM_HEADING, Teacher, resize_place
+from agility_rl.modules.teacher import NUM_HEADING, Teacher
 
 HEADING_SCALE = 1.5
 """Factor on the predicted heading errors (method notes, section 5.9)."""
@@ -29,27 +29,30 @@ HEADING_GATE = 0.6
 
 PERCEIVED_HEADING: NestedKey = ("perceived", keys.HEADING_ERROR)
 PERCEIVED_OBSTACLE: NestedKey = ("perceived", keys.OBSTACLE)
+PERCEIVED_PLACE: NestedKey = ("perceived", keys.PLACE)
 NEXT_HIDDEN: NestedKey = ("memory", keys.HIDDEN)
-"""What the student writes for itself: heading and obstacle as its actor reads them, and the memory of the next step."""
+"""What the student writes for itself: heading, obstacle and place as its actor reads them, and its next memory."""
 
 
 class RecurrentStudent(nn.Module):
     """A behaviour and its parameters from depth images and what the robot measures.
 
     The feature of the present image and the proprioception are fused and remembered by a GRU, which infers the
-    teacher's terrain latent, the heading errors and the type of obstacle. The actor, the estimator and the history
+    teacher's terrain latent, the heading errors and the type of obstacle. Where the teacher reads its place (ours), the
+    student infers that too. The actor, the estimator and the history
     encoder are the teacher's (:meth:`from_teacher`).
 
     Source: kernels, GRU of 512 units, actor {512, 256, 128}: supplement, section S6; fusion 128 and 32, heads, factor
     1.5, gate 0.6: released code (method notes, section 5.9). Ours: the terrain latent passes tanh, as the teacher's
-    does; the actor's gradient does not pass the predicted heading; the memory is reset with the episode (the release
-    carries it on).
+    does; the actor's gradient passes neither the predicted heading nor the predicted place; the memory is reset with
+    the episode (the release carries it on).
 
     Keys read: ``depth`` [*B, 58, 87], ``proprioception`` [*B, 45], ``history`` [*B, 10, 45], ``hidden`` [*B, 512],
     ``is_init`` bool [*B, 1], true in the first step of an episode; with assistance ``heading_error`` [*B, 2] too.
     Keys written: ``depth_feature`` [*B, 32], ``terrain_latent`` [*B, 32], ``heading_estimate`` [*B, 2],
     ``obstacle_logits`` [*B, 7], ``(memory, hidden)`` [*B, 512], ``(perceived, heading_error)``,
-    ``(perceived, obstacle)``, ``estimate``, ``latent`` and those of :class:`~agility_rl.modules.HybridActor`.
+    ``(perceived, obstacle)``, with ``num_place`` also ``place_estimate`` [*B, 8] and ``(perceived, place)``,
+    ``estimate``, ``latent`` and those of :class:`~agility_rl.modules.HybridActor`.
 
     Args:
         num_obstacles: types of obstacles.
@@ -57,6 +60,7 @@ class RecurrentStudent(nn.Module):
         initial_std: standard deviation of the parameters at the start.
         min_std: its floor.
         allowed: indices of the behaviours that it may choose; ``None`` for all.
+        num_place: size of ``place``, as its teacher's.
         memory: units of the GRU.
         encoder_hidden: units of the depth encoder's hidden linear layer.
         heading_gate: see :data:`HEADING_GATE`.
@@ -78,6 +82,7 @@ class RecurrentStudent(nn.Module):
         initial_std: float = 1.0,
         min_std: float = 0.1,
         allowed: Sequence[int] | None = None,
+        num_place: int = 0,
         *,
         memory: int = 512,
         encoder_hidden: int = 128,
@@ -90,6 +95,7 @@ class RecurrentStudent(nn.Module):
             "initial_std": initial_std,
             "min_std": min_std,
             "allowed": None if allowed is None else list(allowed),
+            "num_place": num_place,
             "memory": memory,
             "encoder_hidden": encoder_hidden,
             "heading_gate": heading_gate,
@@ -97,7 +103,7 @@ class RecurrentStudent(nn.Module):
         self.depth_encoder = DepthEncoder(hidden=encoder_hidden)
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
-        self.memory = Memory(32 + features.NUM_PROPRIOCEPTION, memory, num_obstacles)
+        self.memory = Memory(32 + features.NUM_PROPRIOCEPTION, memory, num_obstacles, num_place)
         self.heading_gate = heading_gate
         inputs: dict[NestedKey, int] = {
             keys.PROPRIOCEPTION: features.NUM_PROPRIOCEPTION,
@@ -106,6 +112,7 @@ class RecurrentStudent(nn.Module):
             keys.TERRAIN_LATENT: NUM_TERRAIN_LATENT,
             keys.ESTIMATE: features.NUM_EXPLICIT,
             keys.LATENT: NUM_LATENT,
+            **({PERCEIVED_PLACE: num_place} if num_place else {}),
         }
         self.actor = HybridActor(
             sum(inputs.values()),
@@ -118,16 +125,10 @@ class RecurrentStudent(nn.Module):
 
     @classmethod
     def from_teacher(cls, teacher: Teacher, **options: Any) -> RecurrentStudent:
-        """A student with a teacher's sizes and copies of its actor, estimator and history encoder.
-
-        It does without the place that some teachers read, since no robot measures it.
-        """
-        settings = dict(teacher.settings)
-        place = settings.pop("num_place")
-        student = cls(**settings, **options)
-        for name in ("estimator", "history_encoder"):
+        """A student with a teacher's sizes and copies of its actor, estimator and history encoder."""
+        student = cls(**teacher.settings, **options)
+        for name in ("actor", "estimator", "history_encoder"):
             getattr(student, name).load_state_dict(getattr(teacher, name).state_dict())
-        student.actor.load_state_dict(resize_place(teacher.actor.state_dict(), -place))
         return student
 
     def initial_hidden(self, num_robots: int) -> Tensor:
@@ -144,18 +145,23 @@ class RecurrentStudent(nn.Module):
         """
         remember = self.memory if sequence else _OneStep(self.memory)
         perceive = _Perception(self.heading_gate if assisted else None)
+        placed = self.settings["num_place"] > 0
         return TensorDictSequential(
             self.depth_encoder,
             TensorDictModule(
                 remember,
                 in_keys=[keys.DEPTH_FEATURE, keys.PROPRIOCEPTION, keys.HIDDEN, "is_init"],
-                out_keys=[keys.TERRAIN_LATENT, keys.HEADING_ESTIMATE, keys.OBSTACLE_LOGITS, NEXT_HIDDEN],
+                out_keys=[
+                    *(keys.TERRAIN_LATENT, keys.HEADING_ESTIMATE, keys.OBSTACLE_LOGITS, NEXT_HIDDEN),
+                    *([keys.PLACE_ESTIMATE] if placed else []),
+                ],
             ),
             TensorDictModule(
                 perceive,
                 in_keys=[keys.HEADING_ESTIMATE, keys.OBSTACLE_LOGITS, *([keys.HEADING_ERROR] if assisted else [])],
                 out_keys=[PERCEIVED_HEADING, PERCEIVED_OBSTACLE],
             ),
+            *([TensorDictModule(Tensor.detach, [keys.PLACE_ESTIMATE], [PERCEIVED_PLACE])] if placed else []),
             self.estimator,
             self.history_encoder,
             self.actor,
@@ -163,7 +169,7 @@ class RecurrentStudent(nn.Module):
 
 
 class Memory(nn.Module):
-    """Fuse feature and proprioception, remember, and infer the terrain latent, the heading errors and the obstacle.
+    """Fuse feature and proprioception, remember, and infer terrain latent, heading errors, obstacle and place.
 
     Example:
         >>> memory = Memory(77, 16, 7)
@@ -173,18 +179,19 @@ class Memory(nn.Module):
         [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 16)]
     """
 
-    def __init__(self, in_features: int, hidden_size: int, num_obstacles: int) -> None:
+    def __init__(self, in_features: int, hidden_size: int, num_obstacles: int, num_place: int = 0) -> None:
         super().__init__()
         self.hidden_size = hidden_size
         self.fusion = mlp(in_features, (128,), 32)
         self.cell = nn.GRU(32, hidden_size)
-        self.sizes = (NUM_TERRAIN_LATENT, NUM_HEADING, num_obstacles)
+        self.sizes = (NUM_TERRAIN_LATENT, NUM_HEADING, num_obstacles, num_place)
         self.head = mlp(hidden_size, (), sum(self.sizes))
 
-    def forward(
-        self, feature: Tensor, proprioception: Tensor, hidden: Tensor, is_init: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Steps of ``[T, *B]``: terrain latent, heading errors [rad], obstacle logits, memory after each step."""
+    def forward(self, feature: Tensor, proprioception: Tensor, hidden: Tensor, is_init: Tensor) -> tuple[Tensor, ...]:
+        """Steps of ``[T, *B]``: terrain latent, heading errors [rad], obstacle logits, memory after each step, place.
+
+        The last one only where it has a size.
+        """
         time, batch = feature.shape[0], feature.shape[1:-1]
         fused = self.fusion(torch.cat((feature, proprioception), -1)).reshape(time, -1, 32)
         first = is_init.reshape(time, -1, 1)
@@ -197,8 +204,9 @@ class Memory(nn.Module):
             piece, state = self.cell(fused[start:end], state)
             pieces.append(piece)
         remembered = torch.cat(pieces).reshape(time, *batch, self.hidden_size)
-        latent, heading, logits = self.head(remembered).split(self.sizes, -1)
-        return latent.tanh(), HEADING_SCALE * heading, logits, remembered
+        latent, heading, logits, place = self.head(remembered).split(self.sizes, -1)
+        found = (latent.tanh(), HEADING_SCALE * heading, logits, remembered)
+        return (*found, place) if place.shape[-1] else found
 
 
 class _OneStep(nn.Module):

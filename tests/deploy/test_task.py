@@ -28,10 +28,10 @@ from agility_rl.modules import RecurrentStudent
 from agility_rl.modules.student import NEXT_HIDDEN
 
 
-@pytest.fixture
-def student() -> RecurrentStudent:
+@pytest.fixture(params=[0, 8], ids=["headings only", "place"])
+def student(request: pytest.FixtureRequest) -> RecurrentStudent:
     """Random weights, biases included."""
-    network = RecurrentStudent(hidden=(32, 16), memory=24, encoder_hidden=16)
+    network = RecurrentStudent(hidden=(32, 16), num_place=request.param, memory=24, encoder_hidden=16)
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():
         for parameter in network.parameters():

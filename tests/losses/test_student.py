@@ -64,6 +64,29 @@ def test_values_against_numpy() -> None:
     assert out["accuracy_obstacle"].item() == pytest.approx((obstacle.argmax(-1) == kind).mean())
 
 
+def test_place_against_numpy() -> None:
+    class Placed(Heads):
+        def __init__(self) -> None:
+            super().__init__()
+            self.place = nn.Linear(5, 8)
+
+        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return (*super().forward(x), self.place(x))
+
+    written = ["logits", "loc", "heading_estimate", "obstacle_logits", "place_estimate"]
+    net, td = TensorDictModule(Placed(), in_keys=["x"], out_keys=written), batch()
+    td["place"] = torch.randn(6, 8)
+    loss = StudentLoss(net, place=0.25)
+    assert "place" in loss.in_keys and "place" not in StudentLoss(net).in_keys
+    out = loss(td)
+    distance = np.abs(td["place"].numpy() - net.module.place(td["x"]).detach().numpy())
+    assert out["loss_place"].item() == pytest.approx(0.25 * distance.sum(1).mean(), rel=1e-5)
+    assert out["error_place"].item() == pytest.approx(distance[:, :2].mean(), rel=1e-5)
+    assert set(out.keys()) == set(loss.out_keys)
+    out["loss_place"].backward()
+    assert net.module.place.weight.grad.abs().sum() > 0 and net.module.logits.weight.grad is None
+
+
 def test_only_the_selected_parameters_may_count() -> None:
     net, td = network(), batch()
     loc = net.module(td["x"])[1]

@@ -46,6 +46,7 @@ def test_sizes_are_those_of_the_supplement() -> None:
     assert [p.shape[0] for p in student.memory.fusion.parameters() if p.dim() == 2] == [128, 32]
     assert student.memory.fusion[0].in_features == 32 + 45
     assert student.memory.head[0].out_features == 32 + 2 + 7
+    assert RecurrentStudent(num_place=8).memory.head[0].out_features == 32 + 2 + 7 + 8
 
 
 def test_shapes_and_keys(student: RecurrentStudent) -> None:
@@ -137,18 +138,30 @@ def test_from_a_teacher() -> None:
 
 
 def test_from_a_teacher_that_reads_its_place() -> None:
-    """The student has everything but the place: it does what the teacher does where all of that is 0."""
+    """The student guesses the place, and does what the teacher does where the guess is right."""
     teacher = Teacher(hidden=(32, 16), num_place=8)
     student = RecurrentStudent.from_teacher(teacher, memory=M)
-    assert "num_place" not in student.settings
+    assert student.settings["num_place"] == 8 and "place" not in student.policy(assisted=True).in_keys
     td = steps(1, 3)[0].update({"obstacle": torch.eye(7)[:3], "scandots": torch.randn(3, 132)})
+    seen = student.policy()(td.clone())
+    assert torch.equal(seen["perceived", "place"], seen["place_estimate"]) and seen["place_estimate"].shape == (3, 8)
     with set_interaction_type(InteractionType.DETERMINISTIC):
-        nowhere = teacher.deployable_policy()(td.clone().set("place", torch.zeros(3, 8)))
-        somewhere = teacher.deployable_policy()(td.clone().set("place", torch.ones(3, 8)))
+        expected = teacher.deployable_policy()(td.clone().set("place", seen["place_estimate"].detach()))
         known = td.update({"perceived": {"heading_error": td["heading_error"], "obstacle": td["obstacle"]}})
-        known.update(nowhere.select("terrain_latent", "estimate", "latent"))
-        torch.testing.assert_close(student.actor(known)["loc"], nowhere["loc"])
-    assert not torch.allclose(nowhere["loc"], somewhere["loc"])
+        known["perceived", "place"] = seen["place_estimate"]
+        known.update(expected.select("terrain_latent", "estimate", "latent"))
+        torch.testing.assert_close(student.actor(known)["loc"], expected["loc"])
+        known["perceived", "place"] = known["perceived", "place"] + 1.0
+        assert not torch.allclose(student.actor(known)["loc"], expected["loc"])
+
+
+def test_imitation_does_not_push_the_place() -> None:
+    student = RecurrentStudent(memory=M, num_place=8)
+    td = student.policy(sequence=True)(steps(3, 2))
+    td["loc"].sum().backward(retain_graph=True)
+    assert student.memory.head[0].weight.grad[32:].abs().sum() == 0
+    td["place_estimate"].sum().backward()
+    assert student.memory.head[0].weight.grad[-8:].abs().sum() > 0
 
 
 def test_gradients(student: RecurrentStudent) -> None:

@@ -35,7 +35,7 @@ def untrained(tmp_path: Path) -> Path:
 def untrained_teacher(untrained: Path, tmp_path: Path) -> Path:
     """Run folder of a teacher on the untrained controller, which decides every second control step."""
     torch.manual_seed(0)
-    network = Teacher(len(OBSTACLES), hidden=(16, 16))
+    network = Teacher(len(OBSTACLES), hidden=(16, 16), num_place=8)
     manifest = build_manifest("teacher", features.CONTROLLER_LAYOUTS, control_period=0.04)
     manifest |= {"network": network.settings, "course": "bar_jump"}
     manifest["bbc"] = Artifact.load(untrained / "policy").manifest["weights"]["sha256"]
@@ -50,8 +50,7 @@ def make_student(untrained_teacher: Path, tmp_path: Path, module: Callable[[str]
     def make(name: str = "student", *, byol: bool = True, seed: int = 0, **changes: object) -> Path:
         torch.manual_seed(seed)
         teacher = Artifact.load(untrained_teacher / "policy")
-        sizes = {name: size for name, size in teacher.manifest["network"].items() if name != "num_place"}
-        network = RecurrentStudent(**sizes, memory=16, encoder_hidden=8)
+        network = RecurrentStudent(**teacher.manifest["network"], memory=16, encoder_hidden=8)
         camera = describe_camera()
         camera["training"] = {"frame_steps": 1, "latency": [1, 1], "pitch": 0.09, "offset_noise": 0.05}
         manifest = build_manifest("student", features.CONTROLLER_LAYOUTS, control_period=0.04)

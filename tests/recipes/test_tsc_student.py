@@ -49,7 +49,8 @@ def test_a_run_writes_a_student_and_what_it_saw(
     student = RecurrentStudent(**manifest["network"])
     student.load_state_dict(artifact.state)
     scalars = read_scalars(run)
-    for name in ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_byol", "spread"):
+    losses = ("behaviour", "parameters", "heading", "obstacle", "place", "byol")
+    for name in (*(f"loss_{loss}" for loss in losses), "spread"):
         assert bool(scalars[name][1].isfinite().all()) and bool((scalars[name][1] > 0.0).all()), name
     for name in ("accuracy_behaviour", "accuracy_obstacle", "success/bar_jump", "use/trot", "time/collect"):
         assert bool(scalars[name][1].isfinite().all()), name
@@ -104,7 +105,7 @@ def test_imitation_of_one_window_lowers_its_loss(recipe: ModuleType, module: Mod
     losses = [recipe.imitate(parts, cfg, window, 0) for _ in range(30)]
     first, last = losses[0], losses[-1]
     assert parts.representation is None
-    for name in ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle"):
+    for name in ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_place"):
         assert last[name] < 0.75 * first[name], name
     parts.env.close()
 

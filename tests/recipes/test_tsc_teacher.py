@@ -47,7 +47,8 @@ def test_a_run_writes_what_the_next_stage_needs(recipe: ModuleType, smoke: Any, 
 
 
 def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smoke: Any) -> None:
-    smoke = replace(smoke, place=True, ppo=replace(smoke.ppo, noise_seconds=0.2, critic_learning_rate=1e-3))
+    ppo = replace(smoke.ppo, noise_seconds=0.2, critic_learning_rate=1e-3, averaging=0.75)
+    smoke = replace(smoke, place=True, ppo=ppo)
     whole = recipe.train(replace(smoke, name="whole", iterations=4))
     halves = recipe.train(replace(smoke, name="halves", iterations=2))
     recipe.train(replace(smoke, resume=halves, iterations=4))
@@ -66,6 +67,24 @@ def test_a_finished_course_is_worth_what_the_option_says(recipe: ModuleType) -> 
     assert torch.equal(batch["next", "state_value"], values)
     recipe.value_finished(batch, 12.0)
     assert batch["next", "state_value"].flatten().tolist() == [12.0, 9.0, 0.0, 8.0]
+
+
+def test_what_is_saved_is_the_moving_average_of_weights(
+    recipe: ModuleType, module: Module, smoke: Any, tmp_path: Path
+) -> None:
+    setup, cfg = module("tsc_setup"), replace(smoke, ppo=replace(smoke.ppo, averaging=0.75, critic_warm_up=0))
+    parts, name = recipe.build(cfg), "actor.module.0.module.trunk.layers.0.weight"
+    setup.save_policy(parts, cfg, tmp_path / "start")  # nothing to average yet
+    mean = None
+    for iteration in (0, 2):  # in between the history encoder drives, and the policy stays
+        recipe.iterate(parts, cfg, iteration)
+        now = parts.teacher.state_dict()[name].clone()
+        mean = now if mean is None else 0.75 * mean + 0.25 * now
+    setup.save_policy(parts, cfg, tmp_path / "end")
+    parts.env.close()
+    start, end = (Artifact.load(tmp_path / part / "policy").state[name] for part in ("start", "end"))
+    torch.testing.assert_close(end, mean)
+    assert not torch.equal(end, start) and not torch.equal(end, parts.teacher.state_dict()[name])
 
 
 def test_a_teacher_learns_to_read_its_place_from_where_it_was(recipe: ModuleType, smoke: Any) -> None:
