@@ -6,6 +6,7 @@ What a handler does with a young dog. A teacher may copy it before it learns by 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -50,6 +51,12 @@ PASSAGES: dict[str, Passage] = {
     "tunnel": Passage(-1.1, "trot", 0.7, run_up=0.3),
     "box_jump": Passage(-0.8, "jump", 1.4, 0.4, 0.6),
 }
+LEAPS: dict[str, Passage] = {
+    **PASSAGES,
+    "bar_jump": Passage(-1.25, "jump", 1.8, 0.3),
+    "tire_jump": Passage(-1.25, "jump", 1.8, 0.15),
+}
+"""Over hurdles by a leap out of a trot, for controllers whose jump passes them (docs/agility.md, "Leaps")."""
 USUAL = "trot"
 """Behaviour between obstacles."""
 CRUISE, SLOW = 1.0, 0.5
@@ -74,6 +81,9 @@ ALIGNED = 0.25
 class Guide:
     """Decisions from ``keys.PLACE`` and the type of the obstacle; deterministic, without memory.
 
+    Args:
+        passages: of every type of obstacle.
+
     Attributes:
         complete: it says something before every obstacle.
         behaviours: those that it chooses.
@@ -87,11 +97,11 @@ class Guide:
 
     complete = True
 
-    def __init__(self) -> None:
-        self.behaviours = tuple(sorted({USUAL, *(passage.behaviour for passage in PASSAGES.values())}))
-        passages = [PASSAGES[name] for name in OBSTACLES]
-        self._figures = torch.tensor([[p.start, p.speed, p.tolerance, p.run_up, p.beside] for p in passages])
-        self._skill = torch.tensor([skill_index(p.behaviour) for p in passages])
+    def __init__(self, passages: Mapping[str, Passage] = PASSAGES) -> None:
+        self.behaviours = tuple(sorted({USUAL, *(passage.behaviour for passage in passages.values())}))
+        ordered = [passages[name] for name in OBSTACLES]
+        self._figures = torch.tensor([[p.start, p.speed, p.tolerance, p.run_up, p.beside] for p in ordered])
+        self._skill = torch.tensor([skill_index(p.behaviour) for p in ordered])
 
     def decide(self, td: TensorDictBase) -> TensorDictBase:
         """Decisions of ``N`` robots under ``action``.
@@ -146,6 +156,7 @@ class Guide:
         for index, value in enumerate((speed, sideways, turn)):
             span = (high - low)[:, index]
             parameters[..., index] = (2.0 * (value[:, None] - low[:, index]) / span - 1.0).clamp(-1.0, 1.0)
+        parameters[:, behaviours.JUMP, behaviours.COMMANDS.index("jump_height")] = 1.0  # as high as may be commanded
         return TensorDict({keys.BEHAVIOUR: skill, keys.PARAMETERS: parameters}, [len(skill)])
 
 

@@ -5,12 +5,12 @@ The baseline that a teacher has to beat, and what a teacher may copy before it l
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from tsc_guide import Guide
+from tsc_guide import LEAPS, Guide
 
 from agility_rl import behaviours, keys
 from agility_rl.envs.decisions import NUM_PARAMETERS
@@ -25,17 +25,17 @@ ASIDE = 0.5
 TURN = behaviours.COMMANDS.index("yaw_rate")
 
 
-GUIDE = "guide"
-"""In place of a script: :class:`Guide`, which knows where robots stand."""
+GUIDES = {"guide": Guide(), "leap": Guide(LEAPS)}
+"""In place of a script or a decision: :class:`Guide`, which knows where robots stand; ``leap`` leaps over hurdles."""
 
 
 def read(text: str, option: str = "--script") -> Script | Guide:
-    """What leads robots: ``guide``, or a script (:meth:`Script.parse`).
+    """What leads robots: one of :data:`GUIDES`, or a script (:meth:`Script.parse`).
 
     Raises:
         ValueError: if it is neither.
     """
-    return Guide() if text == GUIDE else Script.parse(text, option)
+    return GUIDES[text] if text in GUIDES else Script.parse(text, option)
 
 
 @dataclass(frozen=True)
@@ -46,45 +46,53 @@ class Script:
         skill: int64 ``[2, 7]``, behaviour before each of :data:`OBSTACLES`; -1 where it says nothing. The second row
             holds while the way-point is more than :data:`ASIDE` off the heading.
         parameters: ``[2, 7, 5, 6]``, forward speed of the chosen behaviour, everything else in the middle of its range.
+        guides: who decides before an obstacle in place of these, by its name.
     """
 
     skill: Tensor
     parameters: Tensor
+    guides: dict[str, Guide] = field(default_factory=dict)
 
     @classmethod
     def parse(cls, text: str, option: str = "--script") -> Script:
         """Read ``BEHAVIOUR:SPEED``, speed in m/s, and after commas what differs, ``OBSTACLE=BEHAVIOUR:SPEED``.
 
         ``FIRST/SECOND`` in place of a decision turns by the second towards way-points that are far aside, as a canter
-        cannot. ``own`` in place of a decision says nothing.
+        cannot. ``own`` in place of a decision says nothing, ``OBSTACLE=guide`` or ``OBSTACLE=leap`` asks a guide.
 
         Raises:
             ValueError: if it is no such text, there is no such obstacle, or the behaviour has no such speed.
         """
         usual, *others = text.split(",")
-        chosen = dict.fromkeys(OBSTACLES, _read_pair(usual, text, option))
+        chosen, guides = dict.fromkeys(OBSTACLES, _read_pair(usual, text, option)), {}
         for other in others:
             name, _, decision = other.partition("=")
             if name not in OBSTACLES:
                 raise ValueError(f"{option}: unknown obstacle {name!r} in {text!r}, expected {', '.join(OBSTACLES)}")
-            chosen[name] = _read_pair(decision, text, option)
+            if decision in GUIDES:
+                guides[name] = GUIDES[decision]
+            else:
+                chosen[name] = _read_pair(decision, text, option)
         skill = torch.tensor([[skill for skill, _ in pair] for pair in chosen.values()]).T
         parameters = torch.zeros(2, len(OBSTACLES), behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS)
         for row, pair in enumerate(chosen.values()):
             for case, (index, speed) in enumerate(pair):
                 if index >= 0:
                     parameters[case, row, index, 0] = speed
-        return cls(skill, parameters)
+        return cls(skill, parameters, guides)
 
     @property
     def behaviours(self) -> tuple[str, ...]:
         """Those that it chooses."""
-        return tuple(behaviours.BEHAVIOURS[index] for index in self.skill.unique().tolist() if index >= 0)
+        own = {behaviours.BEHAVIOURS[index] for index in self.skill.unique().tolist() if index >= 0}
+        own.update(*(guide.behaviours for guide in self.guides.values()))
+        return tuple(name for name in behaviours.BEHAVIOURS if name in own)
 
     @property
     def complete(self) -> bool:
         """Whether it says something before every obstacle."""
-        return bool((self.skill >= 0).all())
+        led = torch.tensor([name in self.guides for name in OBSTACLES])
+        return bool(((self.skill >= 0) | led).all())
 
     def decide(self, td: TensorDictBase) -> TensorDictBase:
         """Decisions of ``N`` robots under ``action``; each behaviour's turn rate leads to the way-point. Where it says
@@ -94,8 +102,12 @@ class Script:
         _, fastest = behaviours.command_bounds(kind.device)
         parameters = self.parameters.to(kind.device)[case, kind]
         parameters[..., TURN] = (STEERING * error / fastest[:, TURN]).clamp(-1.0, 1.0)
-        decision = {keys.BEHAVIOUR: self.skill.to(kind.device)[case, kind], keys.PARAMETERS: parameters}
-        return td.set(keys.ACTION, TensorDict(decision, td.batch_size))
+        skill = self.skill.to(kind.device)[case, kind]
+        for name, guide in self.guides.items():
+            rows = kind == list(OBSTACLES).index(name)
+            told = guide.decide(td[rows])[keys.ACTION]
+            skill, parameters[rows] = skill.masked_scatter(rows, told[keys.BEHAVIOUR]), told[keys.PARAMETERS]
+        return td.set(keys.ACTION, TensorDict({keys.BEHAVIOUR: skill, keys.PARAMETERS: parameters}, td.batch_size))
 
 
 def _read_pair(decision: str, text: str, option: str) -> tuple[tuple[int, float], tuple[int, float]]:

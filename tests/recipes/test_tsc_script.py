@@ -55,6 +55,25 @@ def test_own_says_nothing_but_before_the_obstacles_it_names(script: Any) -> None
     assert chosen.behaviours == ("canter",) and not chosen.complete and script.parse("trot:1.2").complete
 
 
+def test_before_an_obstacle_a_guide_may_decide(script: Any, module: Callable[[str], ModuleType]) -> None:
+    """The guide's decision at the tire, the script's before the others; nothing else is asked of the guide."""
+    chosen = script.parse("own,tire_jump=leap,tunnel=trot:0.8")
+    td = seen(["tire_jump", "bar_jump", "tire_jump", "tunnel"], [0.0] * 4)
+    away = torch.tensor([-3.0, -1.0, -1.0, -1.0])  # of the middle; a leap begins at -1.25
+    ahead = torch.stack((torch.full((4,), 0.5), torch.zeros(4)), -1)
+    td["place"] = torch.cat((ahead, ahead, away[:, None], torch.zeros(4, 2), torch.ones(4, 1)), -1)
+    action = chosen.decide(td.clone())["action"]
+    assert [BEHAVIOURS[i] if i >= 0 else "own" for i in action["behaviour"].tolist()] == ["trot", "own", "jump", "trot"]
+    guide = module("tsc_guide")
+    alone = guide.Guide(guide.LEAPS).decide(td.clone())["action"]
+    assert torch.equal(action["parameters"][[0, 2]], alone["parameters"][[0, 2]])
+    leap, _ = commands_from_parameters(action["behaviour"][2:3], action["parameters"][2, action["behaviour"][2]][None])
+    assert leap[0, [0, 3]].tolist() == pytest.approx([1.8, 0.55])
+    assert not chosen.complete and chosen.behaviours == ("pace", "trot", "jump")
+    assert script.parse("trot:1.0,bar_jump=leap").complete
+    assert module("tsc_script").read("leap").complete and "canter" not in module("tsc_script").read("leap").behaviours
+
+
 def test_a_second_decision_turns_to_way_points_that_are_aside(script: Any) -> None:
     chosen = script.parse("own,bar_jump=canter:1.6/trot:0.7,tunnel=own/pace:0.5")
     kinds = ["bar_jump"] * 3 + ["tunnel"] * 2 + ["seesaw"]
