@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from averaging import moving_average, saved
 from bbc_cloning import Demonstrations
 from bbc_config import Config
 from bbc_world import load_dataset, make_env
@@ -14,7 +15,7 @@ from hardware import training_device
 from held_fixed import INFERRED, privileged_loss
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 from torchrl.objectives.value import GAE
@@ -173,7 +174,7 @@ def build(cfg: Config) -> Components:
         ),
         env=env,
         bbc=bbc,
-        averaged=AveragedModel(bbc, multi_avg_fn=get_ema_multi_avg_fn(ppo.averaging)) if ppo.averaging else None,
+        averaged=moving_average(bbc, ppo.averaging),
         anchor=anchor,
         critic=critic,
         discriminator=discriminator,
@@ -230,10 +231,7 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=parts.env.dt, data=data)
     manifest |= {"network": parts.bbc.settings, "prior": parts.prior.probabilities.tolist()}
     manifest["simulation"] = {"friction_loss": cfg.env.friction_loss}
-    shown: torch.nn.Module = parts.bbc
-    if parts.averaged is not None and parts.averaged.n_averaged > 0:
-        shown = parts.averaged.module
-    Artifact.save(folder / "policy", shown.state_dict(), manifest)
+    Artifact.save(folder / "policy", saved(parts.bbc, parts.averaged).state_dict(), manifest)
     layouts = {"motion": features.MOTION_LAYOUT}
     manifest = build_manifest("discriminator", layouts, control_period=parts.env.dt, data=data)
     manifest["network"] = {

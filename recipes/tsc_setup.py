@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from averaging import moving_average, saved
 from hardware import simulator_options, training_device
 from held_fixed import INFERRED, privileged_loss
 from rollouts import Controller, load_controller
 from tensordict import TensorDictBase
 from torch import Tensor
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import KLAdaptiveLR
 from torchrl.objectives.value import GAE
@@ -145,7 +146,7 @@ def build(cfg: Config) -> Components:
         seeds=seeds,
         env=env,
         teacher=teacher,
-        averaged=AveragedModel(teacher, multi_avg_fn=get_ema_multi_avg_fn(ppo.averaging)) if ppo.averaging else None,
+        averaged=moving_average(teacher, ppo.averaging),
         critic=critic,
         discriminator=None if discriminator is None else discriminator.to(device),
         curriculum=Curriculum.start(cfg.curriculum, env),
@@ -271,7 +272,4 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     manifest["network"] = parts.teacher.settings
     manifest["bbc"] = parts.bbc.artifact.manifest["weights"]["sha256"]
     manifest["course"] = cfg.env.course
-    shown: torch.nn.Module = parts.teacher
-    if parts.averaged is not None and parts.averaged.n_averaged > 0:
-        shown = parts.averaged.module
-    Artifact.save(folder / "policy", shown.state_dict(), manifest)
+    Artifact.save(folder / "policy", saved(parts.teacher, parts.averaged).state_dict(), manifest)
