@@ -63,8 +63,9 @@ class Config:
     run: Annotated[Path | None, tyro.conf.Positional] = None
     """Run or artifact folder of a teacher or student."""
     script: str | None = None
-    """BEHAVIOUR:SPEED [m/s], such as trot:1.2, or trot:1.2,bar_jump=jump:1.4,... , in place of it; or ``guide``, which
-    knows in metres where robots stand."""
+    """BEHAVIOUR:SPEED [m/s], such as trot:1.2, or trot:1.2,bar_jump=jump:1.4,... , in place of it; or ``guide`` or
+    ``leap`` (over hurdles), which know in metres where robots stand; they may also decide for one obstacle:
+    bar_jump=leap."""
     bbc: Path | None = None
     """Folder of the Basic Behaviour Controller: that of the training by default, for a script that of the teachers."""
     course: tuple[str, ...] = ()

@@ -120,9 +120,9 @@ class CloningConfig:
     """Roll-outs in which the teacher copies a script before it learns by itself (ours; 0: not at all)."""
     script: str = "trot:1.2"
     """BEHAVIOUR:SPEED, and OBSTACLE=BEHAVIOUR:SPEED after commas, as ``evaluate_course.py --script`` takes it, or
-    ``guide``, which knows where robots stand (``--place`` lets the teacher know too). With
-    ``own`` in place of the first, a teacher of ``--init-from`` is corrected before those and keeps the rest;
-    ``own/trot:0.6`` corrects it only while the way-point is more than 0.5 rad aside."""
+    ``guide`` or ``leap``, which know where robots stand (``--place`` lets the teacher know too), for all obstacles or
+    as ``OBSTACLE=leap`` for one. With ``own`` in place of the first, a teacher of ``--init-from`` is corrected before
+    those and keeps the rest; ``own/trot:0.6`` corrects it only while the way-point is more than 0.5 rad aside."""
     scripted: float = 0.5
     """Share of the robots that the script drives meanwhile; the teacher sees where its own choices lead with the
     rest, and is told there too what the script would do."""

@@ -34,7 +34,7 @@ from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.losses import functional
-from agility_rl.modules.teacher import resize_place
+from agility_rl.modules.teacher import widen_place
 from agility_rl.training import cli
 
 HEADLINE: tuple[str, ...] = (
@@ -63,7 +63,14 @@ def add_rewards(parts: Components, cfg: Config, batch: TensorDictBase) -> dict[s
 
 
 def value_finished(batch: TensorDictBase, value: float | None) -> None:
-    """Bootstrap finished courses by ``value`` in place of what the critic makes of states that it never sees."""
+    """Bootstrap finished courses by ``value`` in place of what the critic makes of states that it never sees.
+
+    Source: ours (docs/agility.md, "What was measured").
+
+    Args:
+        batch: ``(next, state_value)`` [T, N, 1], changed in place, and bool ``(next, outcome, finished)`` [T, N, 1].
+        value: discounted reward after the finish; ``None`` leaves the critic's, as released.
+    """
     if value is not None:
         batch["next", "state_value"].masked_fill_(batch["next", keys.OUTCOME, "finished"], value)
 
@@ -108,7 +115,7 @@ def begin(parts: Components, cfg: Config) -> None:
         start = Artifact.load(cfg.init_from, kind="teacher")
         had, place = start.manifest.get("network", {}).get("num_place", 0), parts.teacher.settings["num_place"]
         if had < place:  # who did not read its place goes on as it was; who did is refused by a run without
-            start = replace(start, state=resize_place(start.state, place - had))
+            start = replace(start, state=widen_place(start.state, place - had))
         start.fill(parts.teacher)
         head = parts.teacher.actor.network.parameters_head
         head.min_std.fill_(cfg.ppo.min_std)

@@ -39,8 +39,7 @@ class RecurrentStudent(nn.Module):
 
     The feature of the present image and the proprioception are fused and remembered by a GRU, which infers the
     teacher's terrain latent, the heading errors and the type of obstacle. Where the teacher reads its place (ours), the
-    student infers that too. The actor, the estimator and the history
-    encoder are the teacher's (:meth:`from_teacher`).
+    student infers that too. The actor, the estimator and the history encoder are the teacher's (:meth:`from_teacher`).
 
     Source: kernels, GRU of 512 units, actor {512, 256, 128}: supplement, section S6; fusion 128 and 32, heads, factor
     1.5, gate 0.6: released code (method notes, section 5.9). Ours: the terrain latent passes tanh, as the teacher's

@@ -21,25 +21,23 @@ NUM_HEADING = 2
 """Heading errors to the current and to the next way-point (method notes, section 5.4)."""
 
 
-def resize_place(weights: Mapping[str, Tensor], change: int) -> dict[str, Tensor]:
-    """Weights with an actor whose last input, ``place``, is larger or smaller by so many numbers.
-
-    New numbers count nothing yet; without them the actor does what it does where they are 0.
+def widen_place(weights: Mapping[str, Tensor], more: int) -> dict[str, Tensor]:
+    """Weights with an actor whose last input, ``place``, is larger by so many numbers, which count nothing yet.
 
     Source: no equation of the paper (ours).
 
     Args:
         weights: state dict of a teacher or of its actor.
-        change: numbers to add, or to take away where it is negative.
+        more: numbers to add.
 
     Example:
         >>> import torch
         >>> first = "trunk.layers.0.weight"
-        >>> resize_place({first: torch.ones(16, 119)}, 8)[first].shape
+        >>> widen_place({first: torch.ones(16, 119)}, 8)[first].shape
         torch.Size([16, 127])
     """
     first = next(name for name in weights if name.endswith("trunk.layers.0.weight"))
-    return {**weights, first: pad(weights[first], (0, change))}
+    return {**weights, first: pad(weights[first], (0, more))}
 
 
 class Teacher(nn.Module):
