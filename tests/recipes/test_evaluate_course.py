@@ -117,6 +117,7 @@ def test_a_script_needs_no_teacher_and_a_course_may_be_a_file(
 def test_fewer_behaviours(deciders: ModuleType, teacher: Path, untrained: Path) -> None:
     decider = deciders.load_decider(teacher, untrained, ("jump",))
     sizes = {"proprioception": (45,), "history": (10, 45), "heading_error": (2,), "obstacle": (7,), "scandots": (132,)}
+    sizes["place"] = (8,)
     td = TensorDict({name: torch.randn(50, *size) for name, size in sizes.items()}, [50])
     assert set(decider.decide(td)["action", "behaviour"].tolist()) == {4}
     free = deciders.load_decider(teacher, untrained, None)
