@@ -146,7 +146,7 @@ def student_to_export(cfg: Config) -> Exportable:
         task.StudentNetwork(student.eval().requires_grad_(False)),
         task.INPUTS,
         task.OUTPUTS,
-        task.example_inputs(student.memory.hidden_size),
+        task.example_inputs(student.memory.size),
         tuple(seen[name] for name in task.INPUTS),
         tuple(said[name] for name in SAID),
         task.onnx_student,

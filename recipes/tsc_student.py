@@ -44,7 +44,8 @@ from agility_rl.training import cli, distributed
 from agility_rl.training.seeding import permutation
 
 HEADLINE: tuple[str, ...] = ("time/minutes", "success", "episodes", "falls_per_minute")
-HEADLINE += ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_place", "loss_byol", "spread")
+HEADLINE += ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_place", "loss_latent")
+HEADLINE += ("loss_byol", "spread")
 HEADLINE += ("accuracy_behaviour", "accuracy_obstacle", "error_heading", "error_place")
 HEADLINE += tuple(f"success/{name}" for name in OBSTACLES)
 
@@ -108,6 +109,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         lap("pretrain")
     parts.collector.led = round(parts.env.num_robots * annealed(own.led, 0.0, iteration, own.led_until))
     window = parts.collector.collect()
+    if own.latent is not None:
+        known = parts.teacher.scandots_encoder(window.select(keys.SCANDOTS))[keys.TERRAIN_LATENT]
+        window[keys.LABEL, keys.TERRAIN_LATENT] = known
     lap("collect")
     metrics |= judge(parts.env, parts.curriculum, window)
     metrics |= imitate(parts, cfg, window, iteration)

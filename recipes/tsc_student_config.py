@@ -74,6 +74,9 @@ class ImitationConfig:
     """Coefficients of the four terms of Eq. (15): all 1 (method notes, section 5.9)."""
     place: float = 0.25
     """Coefficient of the place, for students of a teacher that reads it (ours)."""
+    latent: float | None = None
+    """Coefficient of the distance to the teacher's terrain latent (ours); without, only what the actor makes of it
+    counts (method notes, section 5.9)."""
     heading_weights: tuple[float, float] = (2.0, 0.5)
     """Of the errors to the current and the next way-point (method notes, section 5.9)."""
     compared: Literal["all", "selected"] = "all"

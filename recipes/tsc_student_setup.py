@@ -118,7 +118,11 @@ def build(cfg: Config, trained: Trained) -> Components:
         seed=seeds.integer("environment"),
     )
     student = RecurrentStudent.from_teacher(
-        teacher, memory=cfg.memory, encoder_hidden=cfg.encoder_hidden, heading_gate=cfg.heading_gate
+        teacher,
+        memory=cfg.memory,
+        encoder_hidden=cfg.encoder_hidden,
+        heading_gate=cfg.heading_gate,
+        period=env.dt * env.decision_steps,
     ).to(device)
     student.estimator.requires_grad_(False)  # it estimates what can be measured: imitation shall not bend it
     # A tenth to a third less time for the convolutions on a CPU.
@@ -138,7 +142,11 @@ def build(cfg: Config, trained: Trained) -> Components:
             imitation.steps,
             initial_hidden=student.initial_hidden(env.num_robots),
             bits=cfg.bits,
-            keep=(keys.HEADING_ERROR, keys.OBSTACLE, *([] if place is None else [keys.PLACE])),
+            keep=(
+                *(keys.HEADING_ERROR, keys.OBSTACLE),
+                *([] if place is None else [keys.PLACE]),
+                *([] if imitation.latent is None else [keys.SCANDOTS]),
+            ),
             keep_next=("reward", keys.OUTCOME, keys.TERMINATIONS),
         ),
         curriculum=Curriculum.start(cfg.curriculum, env),
@@ -150,6 +158,7 @@ def build(cfg: Config, trained: Trained) -> Components:
             heading=imitation.heading,
             obstacle=imitation.obstacle,
             place=place,
+            latent=imitation.latent,
             compared=imitation.compared,
             heading_weights=imitation.heading_weights,
         ),
@@ -193,9 +202,10 @@ def load_student(parts: Components, path: Path) -> None:
         ArtifactError: if it is none, or has other sizes.
     """
     trained = load_trained(path, "student")
-    # A student is told what to do and draws nothing: what its teacher's deviations were makes no difference.
+    # A student is told what to do and draws nothing: what its teacher's deviations were makes no difference. How often
+    # it decides is this run's: it only counts its way by it.
     own, wanted = (
-        {name: value for name, value in network.settings.items() if name not in ("initial_std", "min_std")}
+        {name: value for name, value in network.settings.items() if name not in ("initial_std", "min_std", "period")}
         for network in (trained.network, parts.student)
     )
     if own != wanted:

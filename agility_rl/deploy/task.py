@@ -16,7 +16,7 @@ from agility_rl.deploy.depth import DepthPreprocessor, DepthSource
 from agility_rl.deploy.onnx import onnx_session
 from agility_rl.go2 import camera, features
 from agility_rl.modules import RecurrentStudent
-from agility_rl.modules.student import HEADING_SCALE, PERCEIVED_HEADING, PERCEIVED_OBSTACLE, PERCEIVED_PLACE
+from agility_rl.modules.student import PERCEIVED_HEADING, PERCEIVED_OBSTACLE, PERCEIVED_PLACE
 
 StudentNet = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
 """Depth [1, 58, 87], proprioception [1, 45], history [1, 10, 45] and memory [1, H] to logits [1, 5], parameters
@@ -48,31 +48,30 @@ class StudentNetwork(nn.Module):
     def __init__(self, student: RecurrentStudent) -> None:
         super().__init__()
         self.encoder: nn.Module = student.depth_encoder.module
-        self.memory = student.memory
+        self.memory: Any = student.memory
         self.estimator: nn.Module = student.estimator.module
         self.history_encoder: nn.Module = student.history_encoder.module
         self.actor = student.actor.network
-        self.order = list(student.actor[0].in_keys)
+        self.measured, self.order = student.measured, list(student.actor[0].in_keys)
 
     def forward(
         self, depth: Tensor, proprioception: Tensor, history: Tensor, hidden: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Logits, parameters, heading errors [rad], obstacle logits, memory."""
-        fused = self.memory.fusion(torch.cat((self.encoder(depth), proprioception), -1))
-        _, after = self.memory.cell(fused[None], hidden[None])
-        latent, heading, obstacle, place = self.memory.head(after[0]).split(self.memory.sizes, -1)
-        heading = HEADING_SCALE * heading
+        known = {keys.PROPRIOCEPTION: proprioception, keys.ESTIMATE: self.estimator(proprioception)}
+        latent, heading, obstacle, after, *places = self.memory.step(
+            self.encoder(depth), *(known[name] for name in self.measured), hidden
+        )
         inputs = {
-            keys.PROPRIOCEPTION: proprioception,
+            **known,
             PERCEIVED_HEADING: heading,
             PERCEIVED_OBSTACLE: nn.functional.one_hot(obstacle.argmax(-1), obstacle.shape[-1]).to(obstacle.dtype),
-            PERCEIVED_PLACE: place,
-            keys.TERRAIN_LATENT: latent.tanh(),
-            keys.ESTIMATE: self.estimator(proprioception),
+            **dict(zip((PERCEIVED_PLACE,), places, strict=False)),
+            keys.TERRAIN_LATENT: latent,
             keys.LATENT: self.history_encoder(history),
         }
         logits, parameters, _ = self.actor(*(inputs[name] for name in self.order))
-        return logits, parameters, heading, obstacle, after[0]
+        return logits, parameters, heading, obstacle, after
 
 
 class DeployedStudent:
@@ -125,7 +124,7 @@ class DeployedStudent:
             )
         self.network = network
         self.eyes, self.steps = eyes, max(1, round(artifact.manifest["control_period"] / period))
-        self._memory_size = int(artifact.manifest["network"]["memory"])
+        self._memory_size = memory_size(artifact)
         self._preprocess = DepthPreprocessor()
         with torch.inference_mode():
             for _ in range(10):  # the first calls allocate
@@ -176,6 +175,12 @@ class DeployedStudent:
         """When the newest image was taken [s]."""
         frame = self.eyes.latest()
         return {"depth": -math.inf if frame is None else frame.time}
+
+
+def memory_size(artifact: Artifact) -> int:
+    """Numbers that a student remembers: the units of its GRU and, if it infers one, its place."""
+    network = artifact.manifest["network"]
+    return int(network["memory"]) + int(network.get("num_place", 0))
 
 
 def example_inputs(memory: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

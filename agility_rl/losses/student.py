@@ -21,6 +21,7 @@ from agility_rl.keys import (
     PARAMETERS,
     PLACE,
     PLACE_ESTIMATE,
+    TERRAIN_LATENT,
 )
 from agility_rl.losses.keyed import KeyedLoss, parameter_device
 
@@ -31,13 +32,15 @@ class StudentLoss(KeyedLoss):
     .. math:: L = w_D \, \mathrm{CE}(\ell, a^D_T) + w_C \, E \| a^C_T - \mu \|_2
               + w_\psi \, E \| \mathrm{diag}(2, \tfrac12) (\Delta\psi - \widehat{\Delta\psi}) \|_2
               + w_o \, \mathrm{CE}(\ell_o, o) + w_p \, E \| p - \hat p \|_1
+              + \tfrac{w_z}{32} \, E \| z_T - \hat z \|_2^2
 
     All coefficients are already applied to the losses returned. For a recurrent student give the policy that unrolls
     sequences, ``student.policy(assisted=True, sequence=True)``.
 
     Source: Eq. (15); form, norms and weights of the headings: released code (method notes, section 5.9). Different:
     cross-entropy of the obstacle on logits, not on probabilities; differences of headings are wrapped to (-pi, pi]; the
-    last term (ours) is for students of teachers that read their place.
+    place (ours) is for students of teachers that read theirs; the last term (ours) compares the terrain latents
+    themselves, which the actor's gradient else has to find.
 
     Keys read:
         every entry of ``network.in_keys``
@@ -46,8 +49,10 @@ class StudentLoss(KeyedLoss):
         heading_error        float32 ``[*B, 2]`` [rad]
         obstacle             float32 ``[*B, O]``, one-hot
         place                float32 ``[*B, 8]``      with a coefficient of the place
+        (label, terrain_latent)  float32 ``[*B, 32]`` the teacher's, with a coefficient of the latent
     Keys written (``[]`` each; losses ``[*B]`` with ``reduction="none"``):
-        loss_behaviour, loss_parameters, loss_heading, loss_obstacle, loss_place  only those with a coefficient
+        loss_behaviour, loss_parameters, loss_heading, loss_obstacle, loss_place, loss_latent  only those with a
+                                               coefficient
         accuracy_behaviour, accuracy_obstacle  share that agrees, detached
         error_heading                          mean absolute error to the current way-point [rad], detached
         error_place                            mean absolute error of the current way-point's x and y [m], detached
@@ -60,6 +65,7 @@ class StudentLoss(KeyedLoss):
         heading: coefficient of the headings; schedulable.
         obstacle: coefficient of the obstacle; schedulable.
         place: coefficient of the place; schedulable. The network then writes place estimates ``[*B, 8]`` too.
+        latent: coefficient of the terrain latent; schedulable. The network then writes ``terrain_latent`` too.
         compared: parameters of ``"all"`` choices, as released, or of the one that the teacher ``"selected"``.
         heading_weights: of the errors to the current and the next way-point.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"``.
@@ -88,11 +94,13 @@ class StudentLoss(KeyedLoss):
             heading_estimate (NestedKey): what the network writes, ``[*B, 2]``.
             obstacle_logits (NestedKey): what the network writes, ``[*B, O]``.
             place_estimate (NestedKey): what the network writes, ``[*B, 8]``.
+            terrain_latent (NestedKey): what the network writes, ``[*B, 32]``.
             behaviour (NestedKey): the teacher's choice.
             parameters (NestedKey): the teacher's parameters.
             heading_error (NestedKey): true heading errors.
             obstacle (NestedKey): true obstacle, one-hot.
             place (NestedKey): true place.
+            latent (NestedKey): the teacher's terrain latent.
         """
 
         logits: NestedKey = "logits"
@@ -100,18 +108,20 @@ class StudentLoss(KeyedLoss):
         heading_estimate: NestedKey = HEADING_ESTIMATE
         obstacle_logits: NestedKey = OBSTACLE_LOGITS
         place_estimate: NestedKey = PLACE_ESTIMATE
+        terrain_latent: NestedKey = TERRAIN_LATENT
         behaviour: NestedKey = (LABEL, BEHAVIOUR)
         parameters: NestedKey = (LABEL, PARAMETERS)
         heading_error: NestedKey = HEADING_ERROR
         obstacle: NestedKey = OBSTACLE
         place: NestedKey = PLACE
+        latent: NestedKey = (LABEL, TERRAIN_LATENT)
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     network: TensorDictModule
     network_params: TensorDictParams
     target_network_params: TensorDictParams
-    _schedulable_buffers = frozenset({"behaviour", "continuous", "heading", "obstacle", "place"})
+    _schedulable_buffers = frozenset({"behaviour", "continuous", "heading", "obstacle", "place", "latent"})
 
     def __init__(
         self,
@@ -122,13 +132,14 @@ class StudentLoss(KeyedLoss):
         heading: float | None = 1.0,
         obstacle: float | None = 1.0,
         place: float | None = None,
+        latent: float | None = None,
         compared: Literal["all", "selected"] = "all",
         heading_weights: tuple[float, float] = (2.0, 0.5),
         reduction: str | None = None,
     ) -> None:
         super().__init__()
         coefficients = {"behaviour": behaviour, "continuous": continuous, "heading": heading, "obstacle": obstacle}
-        coefficients["place"] = place
+        coefficients |= {"place": place, "latent": latent}
         if all(value is None for value in coefficients.values()):
             raise ValueError(f"at least one of {', '.join(coefficients)} must be a number, got none")
         if compared not in ("all", "selected"):
@@ -153,6 +164,7 @@ class StudentLoss(KeyedLoss):
             (self.heading, keys.heading_error),
             (self.obstacle, keys.obstacle),
             (self.place, keys.place),
+            (self.latent, keys.latent),
         ):
             if coefficient is not None:
                 targets.append(key)
@@ -173,6 +185,8 @@ class StudentLoss(KeyedLoss):
             names += ["loss_obstacle", "accuracy_obstacle"]
         if self.place is not None:
             names += ["loss_place", "error_place"]
+        if self.latent is not None:
+            names += ["loss_latent"]
         return names
 
     @dispatch(auto_batch_size=False)
@@ -207,6 +221,9 @@ class StudentLoss(KeyedLoss):
             distance = (tensordict.get(keys.place).detach() - written.get(keys.place_estimate)).abs()
             out.set("loss_place", self.place * self._reduce_loss(distance.sum(-1), tensordict))
             out.set("error_place", distance.detach()[..., :2].mean())
+        if self.latent is not None:
+            error = (tensordict.get(keys.latent).detach() - written.get(keys.terrain_latent)).square().mean(-1)
+            out.set("loss_latent", self.latent * self._reduce_loss(error, tensordict))
         self._clear_weakrefs(tensordict, out, "network_params", "target_network_params")
         return out
 

@@ -78,11 +78,12 @@ class DepthNetwork(nn.Module):
         self.height, self.width = height, width
         self.precision = torch.float32
         self.convolutions = nn.Sequential(
-            *(nn.Conv2d(1, channels[0], 5), nn.MaxPool2d(2, 2), nn.ELU()),
-            *(nn.Conv2d(channels[0], channels[1], 3), nn.ELU()),
+            *(nn.Conv2d(1, channels[0], 5), nn.MaxPool2d(2, 2), nn.ELU(inplace=True)),
+            *(nn.Conv2d(channels[0], channels[1], 3), nn.ELU(inplace=True)),
         )
         self.linear = nn.Sequential(
-            *(nn.Flatten(), nn.Linear(channels[1] * rows * columns, hidden), nn.ELU(), nn.Linear(hidden, out_features)),
+            *(_FlattenPixels(), _PixelLinear(channels[1], rows, columns, hidden)),
+            *(nn.ELU(), nn.Linear(hidden, out_features)),
         )
 
     def forward(self, depth: Tensor) -> Tensor:
@@ -92,3 +93,25 @@ class DepthNetwork(nn.Module):
         with torch.autocast(images.device.type, self.precision, enabled=self.precision is not torch.float32):
             features = self.linear(self.convolutions(images))
         return features.float().reshape(*depth.shape[:-2], -1)
+
+
+class _FlattenPixels(nn.Module):
+    """``[N, C, H, W]`` to ``[N, H W C]``, without a copy where the memory is channels-last."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        return images.permute(0, 2, 3, 1).flatten(1)
+
+
+class _PixelLinear(nn.Linear):
+    """A linear layer on :class:`_FlattenPixels`, whose weights are stored in the usual order of channels first.
+
+    To reorder the weights takes the time of some images, and a quarter less time is needed for a minibatch of hundreds.
+    """
+
+    def __init__(self, channels: int, rows: int, columns: int, out_features: int) -> None:
+        super().__init__(channels * rows * columns, out_features)
+        self.image = (channels, rows, columns)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        weight = self.weight.unflatten(1, self.image).permute(0, 2, 3, 1).flatten(1)
+        return nn.functional.linear(pixels, weight, self.bias)

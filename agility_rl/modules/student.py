@@ -12,13 +12,14 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
 from agility_rl import keys
-from agility_rl.go2 import features
+from agility_rl.go2 import constants, features
 from agility_rl.modules.adaptation import HistoryEncoder
 from agility_rl.modules.behaviour_controller import NUM_LATENT
 from agility_rl.modules.depth_encoder import DepthEncoder
 from agility_rl.modules.estimator import StateEstimator
 from agility_rl.modules.hybrid_actor import HybridActor
 from agility_rl.modules.mlp import mlp
+from agility_rl.modules.placed_memory import NUM_PLACE, PlacedMemory
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 from agility_rl.modules.teacher import NUM_HEADING, Teacher
 
@@ -39,14 +40,16 @@ class RecurrentStudent(nn.Module):
 
     The feature of the present image and the proprioception are fused and remembered by a GRU, which infers the
     teacher's terrain latent, the heading errors and the type of obstacle. Where the teacher reads its place (ours), the
-    student infers that too. The actor, the estimator and the history encoder are the teacher's (:meth:`from_teacher`).
+    student infers that too, and from it the heading errors (:class:`~agility_rl.modules.placed_memory.PlacedMemory`).
+    The actor, the estimator and the history encoder are the teacher's (:meth:`from_teacher`).
 
     Source: kernels, GRU of 512 units, actor {512, 256, 128}: supplement, section S6; fusion 128 and 32, heads, factor
     1.5, gate 0.6: released code (method notes, section 5.9). Ours: the terrain latent passes tanh, as the teacher's
     does; the actor's gradient passes neither the predicted heading nor the predicted place; the memory is reset with
     the episode (the release carries it on).
 
-    Keys read: ``depth`` [*B, 58, 87], ``proprioception`` [*B, 45], ``history`` [*B, 10, 45], ``hidden`` [*B, 512],
+    Keys read: ``depth`` [*B, 58, 87], ``proprioception`` [*B, 45], ``history`` [*B, 10, 45], ``hidden`` [*B, 512]
+    (520 with ``num_place``),
     ``is_init`` bool [*B, 1], true in the first step of an episode; with assistance ``heading_error`` [*B, 2] too.
     Keys written: ``depth_feature`` [*B, 32], ``terrain_latent`` [*B, 32], ``heading_estimate`` [*B, 2],
     ``obstacle_logits`` [*B, 7], ``(memory, hidden)`` [*B, 512], ``(perceived, heading_error)``,
@@ -59,10 +62,14 @@ class RecurrentStudent(nn.Module):
         initial_std: standard deviation of the parameters at the start.
         min_std: its floor.
         allowed: indices of the behaviours that it may choose; ``None`` for all.
-        num_place: size of ``place``, as its teacher's.
+        num_place: size of ``place``, as its teacher's: 0 or 8.
         memory: units of the GRU.
         encoder_hidden: units of the depth encoder's hidden linear layer.
         heading_gate: see :data:`HEADING_GATE`.
+        period: of a decision [s]; who infers the place counts what it has gone meanwhile.
+
+    Raises:
+        ValueError: if ``num_place`` is another number.
 
     Example:
         >>> from tensordict import TensorDict
@@ -86,8 +93,11 @@ class RecurrentStudent(nn.Module):
         memory: int = 512,
         encoder_hidden: int = 128,
         heading_gate: float = HEADING_GATE,
+        period: float = constants.CONTROL_DT,
     ) -> None:
         super().__init__()
+        if num_place not in (0, NUM_PLACE):
+            raise ValueError(f"num_place must be 0 or {NUM_PLACE}, got {num_place}")
         self.settings: dict[str, Any] = {
             "num_obstacles": num_obstacles,
             "hidden": list(hidden),
@@ -98,11 +108,14 @@ class RecurrentStudent(nn.Module):
             "memory": memory,
             "encoder_hidden": encoder_hidden,
             "heading_gate": heading_gate,
+            **({"period": period} if num_place else {}),
         }
         self.depth_encoder = DepthEncoder(hidden=encoder_hidden)
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
-        self.memory = Memory(32 + features.NUM_PROPRIOCEPTION, memory, num_obstacles, num_place)
+        inputs_of_memory = (32 + features.NUM_PROPRIOCEPTION, memory, num_obstacles)
+        self.memory = PlacedMemory(*inputs_of_memory, period) if num_place else Memory(*inputs_of_memory)
+        self.measured = [keys.PROPRIOCEPTION, *([keys.ESTIMATE] if num_place else [])]
         self.heading_gate = heading_gate
         inputs: dict[NestedKey, int] = {
             keys.PROPRIOCEPTION: features.NUM_PROPRIOCEPTION,
@@ -131,8 +144,8 @@ class RecurrentStudent(nn.Module):
         return student
 
     def initial_hidden(self, num_robots: int) -> Tensor:
-        """Memory of robots that have not seen anything, ``[N, memory]``."""
-        return torch.zeros(num_robots, self.memory.hidden_size, device=next(self.parameters()).device)
+        """Memory of robots that have not seen anything, ``[N, M]``."""
+        return torch.zeros(num_robots, self.memory.size, device=next(self.parameters()).device)
 
     def policy(self, *, assisted: bool = False, sequence: bool = False) -> TensorDictSequential:
         """The policy, sharing this student's parameters.
@@ -147,9 +160,10 @@ class RecurrentStudent(nn.Module):
         placed = self.settings["num_place"] > 0
         return TensorDictSequential(
             self.depth_encoder,
+            self.estimator,
             TensorDictModule(
                 remember,
-                in_keys=[keys.DEPTH_FEATURE, keys.PROPRIOCEPTION, keys.HIDDEN, "is_init"],
+                in_keys=[keys.DEPTH_FEATURE, *self.measured, keys.HIDDEN, "is_init"],
                 out_keys=[
                     *(keys.TERRAIN_LATENT, keys.HEADING_ESTIMATE, keys.OBSTACLE_LOGITS, NEXT_HIDDEN),
                     *([keys.PLACE_ESTIMATE] if placed else []),
@@ -161,14 +175,21 @@ class RecurrentStudent(nn.Module):
                 out_keys=[PERCEIVED_HEADING, PERCEIVED_OBSTACLE],
             ),
             *([TensorDictModule(Tensor.detach, [keys.PLACE_ESTIMATE], [PERCEIVED_PLACE])] if placed else []),
-            self.estimator,
             self.history_encoder,
             self.actor,
         )
 
 
 class Memory(nn.Module):
-    """Fuse feature and proprioception, remember, and infer terrain latent, heading errors, obstacle and place.
+    """Fuse feature and proprioception, remember, and infer terrain latent, heading errors and obstacle.
+
+    Args:
+        in_features: of feature and proprioception together.
+        hidden_size: units of the GRU.
+        num_obstacles: types of obstacles.
+
+    Attributes:
+        size: of the memory.
 
     Example:
         >>> memory = Memory(77, 16, 7)
@@ -178,23 +199,23 @@ class Memory(nn.Module):
         [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 16)]
     """
 
-    def __init__(self, in_features: int, hidden_size: int, num_obstacles: int, num_place: int = 0) -> None:
+    def __init__(self, in_features: int, hidden_size: int, num_obstacles: int) -> None:
         super().__init__()
-        self.hidden_size = hidden_size
+        self.size = hidden_size
         self.fusion = mlp(in_features, (128,), 32)
         self.cell = nn.GRU(32, hidden_size)
-        self.sizes = (NUM_TERRAIN_LATENT, NUM_HEADING, num_obstacles, num_place)
+        self.sizes = (NUM_TERRAIN_LATENT, NUM_HEADING, num_obstacles)
         self.head = mlp(hidden_size, (), sum(self.sizes))
 
     def forward(self, feature: Tensor, proprioception: Tensor, hidden: Tensor, is_init: Tensor) -> tuple[Tensor, ...]:
-        """Steps of ``[T, *B]``: terrain latent, heading errors [rad], obstacle logits, memory after each step, place.
+        """Steps of ``[T, *B]``: terrain latent, heading errors [rad], obstacle logits, memory after each step.
 
-        The last one only where it has a size.
+        Of ``hidden`` only the first step's counts; it begins with zeros where ``is_init`` says so.
         """
         time, batch = feature.shape[0], feature.shape[1:-1]
-        fused = self.fusion(torch.cat((feature, proprioception), -1)).reshape(time, -1, 32)
+        fused = self._fuse(feature, proprioception)
         first = is_init.reshape(time, -1, 1)
-        state = hidden[0].reshape(1, -1, self.hidden_size)
+        state = hidden[0].reshape(1, -1, self.size)
         # One call of the GRU from each step in which somebody begins an episode to the next.
         edges = sorted({0, time, *first.flatten(1).any(1).nonzero()[:, 0].tolist()})
         pieces = []
@@ -202,21 +223,33 @@ class Memory(nn.Module):
             state = state.masked_fill(first[start][None], 0.0)
             piece, state = self.cell(fused[start:end], state)
             pieces.append(piece)
-        remembered = torch.cat(pieces).reshape(time, *batch, self.hidden_size)
-        latent, heading, logits, place = self.head(remembered).split(self.sizes, -1)
-        found = (latent.tanh(), HEADING_SCALE * heading, logits, remembered)
-        return (*found, place) if place.shape[-1] else found
+        return self._infer(torch.cat(pieces).reshape(time, *batch, self.size))
+
+    def step(self, feature: Tensor, proprioception: Tensor, hidden: Tensor) -> tuple[Tensor, ...]:
+        """One step of ``[*B]``, with outputs as :meth:`forward`."""
+        fused = self._fuse(feature[None], proprioception[None])
+        _, after = self.cell(fused, hidden.reshape(1, -1, self.size))
+        return self._infer(after.reshape(*feature.shape[:-1], self.size))
+
+    def _fuse(self, feature: Tensor, proprioception: Tensor) -> Tensor:
+        return self.fusion(torch.cat((feature, proprioception), -1)).reshape(len(feature), -1, 32)
+
+    def _infer(self, remembered: Tensor) -> tuple[Tensor, ...]:
+        latent, heading, logits = self.head(remembered).split(self.sizes, -1)
+        return latent.tanh(), HEADING_SCALE * heading, logits, remembered
 
 
 class _OneStep(nn.Module):
-    """:class:`Memory` for one step of ``[*B]``."""
+    """A memory for one step of ``[*B]``, that may be an episode's first."""
 
-    def __init__(self, memory: Memory) -> None:
+    def __init__(self, memory: Memory | PlacedMemory) -> None:
         super().__init__()
-        self.memory = memory
+        self.memory: Any = memory
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        return tuple(output[0] for output in self.memory(*(value[None] for value in inputs)))
+        *measured, hidden, is_init = inputs
+        outputs: tuple[Tensor, ...] = self.memory.step(*measured, hidden.masked_fill(is_init, 0.0))
+        return outputs
 
 
 class _Perception(nn.Module):

@@ -187,10 +187,10 @@ def test_the_network_has_no_memory_of_its_own(student: RecurrentStudent) -> None
         torch.rand(1, 58, 87, generator=generator) - 0.5,
         torch.randn(1, 45, generator=generator),
         torch.randn(1, 10, 45, generator=generator),
-        torch.randn(1, 24, generator=generator),
+        torch.randn(1, student.memory.size, generator=generator),
     )
     with torch.no_grad():
         first, second = network(*inputs), network(*inputs)
-        other = network(*inputs[:3], torch.zeros(1, 24))
+        other = network(*inputs[:3], torch.zeros(1, student.memory.size))
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
     assert not torch.equal(first[-1], other[-1])

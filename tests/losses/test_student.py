@@ -87,6 +87,28 @@ def test_place_against_numpy() -> None:
     assert net.module.place.weight.grad.abs().sum() > 0 and net.module.logits.weight.grad is None
 
 
+def test_latent_against_numpy() -> None:
+    class Seeing(Heads):
+        def __init__(self) -> None:
+            super().__init__()
+            self.latent = nn.Linear(5, 32)
+
+        def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            return (*super().forward(x), self.latent(x))
+
+    written = ["logits", "loc", "heading_estimate", "obstacle_logits", "terrain_latent"]
+    net, td = TensorDictModule(Seeing(), in_keys=["x"], out_keys=written), batch()
+    td["label", "terrain_latent"] = torch.randn(6, 32)
+    loss = StudentLoss(net, latent=2.0)
+    assert ("label", "terrain_latent") in loss.in_keys and ("label", "terrain_latent") not in StudentLoss(net).in_keys
+    out = loss(td)
+    distance = td["label", "terrain_latent"].numpy() - net.module.latent(td["x"]).detach().numpy()
+    assert out["loss_latent"].item() == pytest.approx(2.0 * (distance**2).mean(), rel=1e-5)
+    assert set(out.keys()) == set(loss.out_keys)
+    out["loss_latent"].backward()
+    assert net.module.latent.weight.grad.abs().sum() > 0 and net.module.logits.weight.grad is None
+
+
 def test_only_the_selected_parameters_may_count() -> None:
     net, td = network(), batch()
     loc = net.module(td["x"])[1]
