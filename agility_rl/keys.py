@@ -96,7 +96,7 @@ DEPTH_FEATURE = "depth_feature"
 """float32 ``[*B, 32]``, what the depth encoder makes of one image."""
 
 HIDDEN = "hidden"
-"""float32 ``[*B, 512]``, the student's memory before a step."""
+"""float32 ``[*B, 512]``, the student's memory before a step; with its place behind it ``[*B, 520]``."""
 
 HEADING_ESTIMATE = "heading_estimate"
 """float32 ``[*B, 2]``, the student's guess of :data:`HEADING_ERROR` [rad]."""
