@@ -65,7 +65,7 @@ def add_rewards(parts: Components, cfg: Config, batch: TensorDictBase) -> dict[s
 def value_finished(batch: TensorDictBase, value: float | None) -> None:
     """Bootstrap finished courses by ``value`` in place of what the critic makes of states that it never sees.
 
-    Source: ours (docs/agility.md, "What was measured").
+    Source: ours (docs/agility.md, "What helped, by experiment").
 
     Args:
         batch: ``(next, state_value)`` [T, N, 1], changed in place, and bool ``(next, outcome, finished)`` [T, N, 1].
