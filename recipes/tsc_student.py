@@ -9,7 +9,7 @@ Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap``, ``checkpoints/``, ``
 
     python recipes/tsc_student.py cpu --teacher runs/my_teacher --name my_student
     python recipes/tsc_student.py cpu --teacher runs/my_teacher --name without --no-byol
-    python recipes/tsc_student.py cpu --teacher runs/my_teacher --pretrain.images 20000
+    python recipes/tsc_student.py cpu --teacher runs/my_teacher --glance.images 20000 --glance.steps 16
     python recipes/tsc_student.py cpu --resume runs/my_student            # goes on exactly where it stopped
 
 Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper``. Ctrl-C ends the iteration and saves.
@@ -17,11 +17,12 @@ Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper``. Ctrl-C ends the it
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import torch
 from course_metrics import judge, set_course
-from encoder_pretraining import pretrain
+from glances import pretrain
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from training_run import Laps, own_options, run
@@ -57,7 +58,7 @@ def imitate(parts: Components, cfg: Config, window: TensorDictBase, iteration: i
     for _ in range(own.epochs):
         for rows in permutation(window.shape[1], parts.generator).chunk(own.minibatches):
             sample = window[:, rows]
-            if own.augment:
+            if own.augment and keys.DEPTH in parts.imitation.in_keys:
                 sample[keys.DEPTH] = parts.augmentation.augment(dequantize(sample[keys.DEPTH]))
             losses = parts.imitation(sample)
             total = torch.stack([value for name, value in losses.items() if name.startswith("loss_")]).sum()
@@ -104,8 +105,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         set_learning_rate(byol.optimizer, annealed(*rates, iteration, own.decay))
     set_course(parts.env, parts.curriculum)
     metrics: dict[str, Tensor | float] = {}
-    if iteration == 0 and cfg.pretrain.images > 0 and cfg.init_from is None:
-        metrics |= pretrain(parts, cfg, None if byol is None else lambda images: represent(parts, iteration, images))
+    if iteration == 0 and parts.glances is not None and cfg.glance.images > 0 and cfg.init_from is None:
+        also = None if byol is None else partial(represent, parts, iteration)
+        metrics |= pretrain(parts.glances, parts.env, parts.teacher, cfg.glance, cfg.bits, also)
         lap("pretrain")
     parts.collector.led = round(parts.env.num_robots * annealed(own.led, 0.0, iteration, own.led_until))
     window = parts.collector.collect()
@@ -116,6 +118,12 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     metrics |= judge(parts.env, parts.curriculum, window)
     metrics |= imitate(parts, cfg, window, iteration)
     lap("imitation")
+    if parts.glances is not None and cfg.glance.steps:
+        rates = (cfg.glance.learning_rate, cfg.glance.final_learning_rate)
+        set_learning_rate(parts.glances.optimizer, annealed(*rates, iteration, own.decay))
+        parts.glances.keep(window[:: cfg.glance.every], parts.teacher)
+        metrics |= parts.glances.learn(cfg.glance.steps)
+        lap("glances")
     if byol is not None:
         metrics |= represent_window(parts, cfg, window, iteration)
         lap("byol")
@@ -127,7 +135,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
 
 def check(cfg: Config) -> None:
     """Refuse impossible options before anything is loaded."""
-    own, pre = cfg.imitation, cfg.pretrain
+    own, glance = cfg.imitation, cfg.glance
     if min(own.steps, own.epochs, own.minibatches, own.decay, cfg.representation.minibatches) < 1:
         raise ValueError("expected imitation.steps, epochs, minibatches, decay and representation.minibatches above 0")
     if not 0.0 <= own.led <= 1.0 or own.led_until < 1:
@@ -139,10 +147,10 @@ def check(cfg: Config) -> None:
     smallest = min(cfg.representation.images, cfg.env.num_robots * own.steps) // cfg.representation.minibatches
     if cfg.byol and smallest < 2:
         raise ValueError(f"--representation: a minibatch of BYOL needs 2 images or more, got {smallest}")
-    if pre.images and (cfg.env.num_robots < 2 or min(pre.every, pre.epochs, pre.batch) < 1 or not 0 < pre.held_out < 1):
-        raise ValueError(
-            "--pretrain: expected two robots or more, every, epochs and batch of at least 1, held-out within (0, 1)"
-        )
+    if min(glance.every, glance.epochs, glance.batch, glance.kept) < 1 or min(glance.steps, glance.images) < 0:
+        raise ValueError("--glance: expected every, epochs, batch and kept above 0, steps and images of at least 0")
+    if glance.images and (cfg.env.num_robots < 2 or not 0 < glance.held_out < 1):
+        raise ValueError("--glance.images: expected two robots or more, and held-out within (0, 1)")
 
 
 def begin(parts: Components, cfg: Config) -> None:

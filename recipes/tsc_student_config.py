@@ -106,17 +106,27 @@ class RepresentationConfig:
 
 
 @dataclass(frozen=True)
-class PretrainConfig:
+class GlanceConfig:
+    """What single images are asked for (ours): the teacher's terrain latent, the obstacle ahead, the place."""
+
+    steps: int = 0
+    """Gradient steps of an iteration by which the encoder learns so, and so only: the imitation then trains memory and
+    actor on features. 0: the encoder learns within the imitation (method notes, section 5.9)."""
     images: int = 0
-    """To collect on the course, where the teacher walks, before the imitation begins; 0 for no pre-training (ours).
-    A run that starts from another student does without."""
-    every: int = 2
-    """Decisions between two of them."""
+    """To collect on the course, where the teacher walks, before the imitation begins; 0 for no pre-training. A run that
+    starts from another student does without."""
+    every: int = 4
+    """Decisions between two images of a robot that are kept."""
     epochs: int = 4
-    batch: int = 256
+    """Of the pre-training."""
+    batch: int = 128
     learning_rate: float = 1e-3
+    final_learning_rate: float = 1e-4
+    """Falls as that of the imitation does."""
+    kept: int = 40_000
+    """Newest images, of which the steps draw."""
     held_out: float = 0.1
-    """Share of the robots whose images measure and do not train."""
+    """Share of the robots whose images measure the pre-training and do not train."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +165,7 @@ class Config(HardwareConfig):
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     representation: RepresentationConfig = field(default_factory=RepresentationConfig)
-    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
+    glance: GlanceConfig = field(default_factory=GlanceConfig)
     curriculum: CurriculumConfig = field(
         default_factory=lambda: CurriculumConfig(difficulty=1.0, obstacles=6, practice=0.0)
     )
@@ -183,6 +193,6 @@ SMOKE = replace(
     env=replace(CPU.env, num_robots=4),
     imitation=replace(CPU.imitation, steps=4, minibatches=2),
     representation=replace(CPU.representation, images=8, hidden=16),
-    pretrain=PretrainConfig(images=8, every=1, epochs=1, batch=4, held_out=0.25),
+    glance=GlanceConfig(images=8, every=1, epochs=1, batch=4, held_out=0.25, kept=16),
 )
 PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}

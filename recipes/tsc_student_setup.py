@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from glances import Glances
 from hardware import simulator_options, training_device
 from rollouts import Controller
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 from tsc_artifacts import Trained, load_bbc_of, load_trained, trained_bbc
 from tsc_curriculum import Curriculum
@@ -27,6 +28,7 @@ from agility_rl.envs import AgilityEnv
 from agility_rl.go2 import features
 from agility_rl.losses import BYOLLoss, StudentLoss
 from agility_rl.modules import BYOL, DepthAugmentation, RecurrentStudent, Teacher
+from agility_rl.training import distributed
 from agility_rl.training.precision import hidden_precision
 from agility_rl.training.seeding import Seeds, seed_everything
 
@@ -61,6 +63,7 @@ class Components:
     imitation: StudentLoss
     optimizer: torch.optim.Optimizer
     representation: Representation | None
+    glances: Glances | None
     bbc: Controller
 
     @property
@@ -74,12 +77,15 @@ class Components:
         parts = {name: getattr(self, name) for name in ("student", "curriculum", "optimizer")}
         if self.representation is not None:
             parts |= {"byol": self.representation.loss, "byol_optimizer": self.representation.optimizer}
+        if self.glances is not None:
+            parts |= {"glance": self.glances.head, "glance_optimizer": self.glances.optimizer}
         return parts
 
     @property
     def own(self) -> dict[str, Any]:
         """What each process has for itself."""
-        return {name: getattr(self, name) for name in ("seeds", "env", "collector")}
+        own = {name: getattr(self, name) for name in ("seeds", "env", "collector")}
+        return own if self.glances is None else own | {"images": self.glances.images}
 
 
 def resolve(cfg: Config) -> tuple[Config, Trained]:
@@ -128,6 +134,11 @@ def build(cfg: Config, trained: Trained) -> Components:
     # A tenth to a third less time for the convolutions on a CPU.
     student.depth_encoder.to(memory_format=torch.channels_last)
     student.depth_encoder.module.precision = hidden_precision(cfg.precision, device)
+    apart = cfg.glance.steps > 0
+    augmentation = make_augmentation(cfg.augmentation, seeds.generator("augmentation"))
+    glances = None
+    if apart or (cfg.glance.images > 0 and cfg.init_from is None):
+        glances = Glances.of(student, cfg.glance, augmentation, seeds.generator("batches"))
     imitation, place = cfg.imitation, cfg.imitation.place if teacher.settings["num_place"] else None
     return Components(
         seeds=seeds,
@@ -145,14 +156,16 @@ def build(cfg: Config, trained: Trained) -> Components:
             keep=(
                 *(keys.HEADING_ERROR, keys.OBSTACLE),
                 *([] if place is None else [keys.PLACE]),
-                *([] if imitation.latent is None else [keys.SCANDOTS]),
+                *([keys.SCANDOTS] if apart or imitation.latent is not None else []),
+                *([keys.PLACE] if apart else []),
             ),
+            keep_written=[keys.DEPTH_FEATURE] if apart else [],
             keep_next=("reward", keys.OUTCOME, keys.TERMINATIONS),
         ),
         curriculum=Curriculum.start(cfg.curriculum, env),
-        augmentation=make_augmentation(cfg.augmentation, seeds.generator("augmentation")),
+        augmentation=augmentation,
         imitation=StudentLoss(
-            student.policy(assisted=True, sequence=True),
+            student.policy(assisted=True, sequence=True, seen=apart),
             behaviour=imitation.behaviour,
             continuous=imitation.continuous,
             heading=imitation.heading,
@@ -162,12 +175,17 @@ def build(cfg: Config, trained: Trained) -> Components:
             compared=imitation.compared,
             heading_weights=imitation.heading_weights,
         ),
-        optimizer=torch.optim.Adam(
-            [parameter for parameter in student.parameters() if parameter.requires_grad], lr=imitation.learning_rate
-        ),
+        optimizer=torch.optim.Adam(imitated(student, glances if apart else None), lr=imitation.learning_rate),
         representation=make_representation(cfg, student) if cfg.byol else None,
+        glances=glances,
         bbc=controller,
     )
+
+
+def imitated(student: RecurrentStudent, glances: Glances | None) -> list[nn.Parameter]:
+    """What the imitation trains: everything but what is frozen, and what learns from glances."""
+    own = set() if glances is None else {id(weight) for weight in distributed.optimized(glances.optimizer)}
+    return [weight for weight in student.parameters() if weight.requires_grad and id(weight) not in own]
 
 
 def make_augmentation(cfg: AugmentationConfig, generator: torch.Generator) -> DepthAugmentation:

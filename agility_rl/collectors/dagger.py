@@ -35,6 +35,7 @@ class DAggerCollector:
         bits: how images are stored.
         keep: observations to store beside those that the student reads.
         keep_next: entries of the next state to store beside the three done flags.
+        keep_written: entries that the student writes to store, such as ``depth_feature``.
         depth_key: key of the images; ``None`` where there are none.
         hidden_key: key of the memory that the student reads.
         next_hidden_key: key of the memory that it writes.
@@ -76,6 +77,7 @@ class DAggerCollector:
         bits: Literal[8, 16] = 8,
         keep: Sequence[NestedKey] = (HEADING_ERROR, OBSTACLE),
         keep_next: Sequence[NestedKey] = ("reward",),
+        keep_written: Sequence[NestedKey] = (),
         depth_key: NestedKey | None = DEPTH,
         hidden_key: NestedKey = HIDDEN,
         next_hidden_key: NestedKey = ("memory", HIDDEN),
@@ -102,6 +104,7 @@ class DAggerCollector:
         if missing := [key for key in student.in_keys if key not in observed | own]:
             raise ValueError(f"the student reads {missing}, which the environment does not write")
         self.keep = [*dict.fromkeys([*(key for key in student.in_keys if key != hidden_key), *keep])]
+        self.keep_written = list(keep_written)
         self.keep_next = [*keep_next, "done", "terminated", "truncated"]
         self.depth_key, self.hidden_key, self.next_hidden_key = depth_key, hidden_key, next_hidden_key
         self.action_key, self.label_key = action_key, label_key
@@ -125,7 +128,7 @@ class DAggerCollector:
             with set_interaction_type(InteractionType.DETERMINISTIC):
                 acting = self.student(carrier.select(*self.student.in_keys))
                 label = self.teacher(carrier.select(*self.teacher.in_keys)).get(self.action_key)
-            row = carrier.select(*self.keep)
+            row = carrier.select(*self.keep).update(acting.select(*self.keep_written))
             action, label = _decision(acting.get(self.action_key)), _decision(label)
             if self.led:
                 action[: self.led] = label[: self.led]

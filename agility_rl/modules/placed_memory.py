@@ -11,8 +11,6 @@ from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 
 NUM_PLACE = 8
 """Way-point, the next one, and the robot's place at the obstacle (:data:`agility_rl.keys.PLACE`)."""
-PLACE_SCALE = 2.0
-"""Factor on a place that the network says [m]."""
 GAIN = -1.5
 """Added to the gains' logits: at the start a fifth of what the network says is believed at each decision."""
 
@@ -32,13 +30,15 @@ class PlacedMemory(nn.Module):
     T moves a place by half a decision's motion, as gyroscope, attitude and estimated velocity give it
     (:func:`planar_motion`, :func:`moved`), S puts the next way-point in the first one's place, and the gains k and s in
     (0, 1) and the place m are read from a GRU, which sees the image's feature, proprioception and
-    :math:`\bar p_t`. Who has seen nothing has a place of zeros, that no robot can have, since sine and cosine are 0.
+    :math:`\bar p_t`. To terrain latent, obstacle and m is added what the image's feature says by itself, by a linear map
+    (``glance``). Who has seen nothing has a place of zeros, that no robot can have, since sine and cosine are 0.
 
     Source: ours; prediction and correction are those of a Kalman filter (Kalman 1960, doi:10.1115/1.3662552). Sizes of
     fusion and GRU: method notes, section 5.9.
 
     Args:
-        in_features: of feature and proprioception together.
+        features: of an image.
+        measured: numbers of proprioception.
         hidden_size: units of the GRU.
         num_obstacles: types of obstacles.
         period: of a decision [s].
@@ -47,20 +47,21 @@ class PlacedMemory(nn.Module):
         size: of the memory: units of the GRU, and the place after half a decision more.
 
     Example:
-        >>> memory = PlacedMemory(77, 16, 7, 0.04)
+        >>> memory = PlacedMemory(32, 45, 16, 7, 0.04)
         >>> outputs = memory(torch.zeros(5, 3, 32), torch.zeros(5, 3, 45), torch.zeros(5, 3, 4),
         ...     torch.zeros(5, 3, 24), torch.zeros(5, 3, 1, dtype=torch.bool))
         >>> [tuple(output.shape) for output in outputs]
         [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 24), (5, 3, 8)]
     """
 
-    def __init__(self, in_features: int, hidden_size: int, num_obstacles: int, period: float) -> None:
+    def __init__(self, features: int, measured: int, hidden_size: int, num_obstacles: int, period: float) -> None:
         super().__init__()
         self.size, self.hidden_size, self.period = hidden_size + NUM_PLACE, hidden_size, period
-        self.fusion = mlp(in_features + NUM_PLACE, (128,), 32)
+        self.fusion = mlp(features + measured + NUM_PLACE, (128,), 32)
         self.cell = nn.GRUCell(32, hidden_size)
-        self.sizes = (NUM_TERRAIN_LATENT, num_obstacles, NUM_PLACE, NUM_PLACE + 1)
+        self.sizes = (NUM_TERRAIN_LATENT + num_obstacles + NUM_PLACE, NUM_PLACE + 1)
         self.head = mlp(hidden_size, (), sum(self.sizes))
+        self.glance = mlp(features, (), self.sizes[0])
 
     def forward(
         self, feature: Tensor, proprioception: Tensor, estimate: Tensor, hidden: Tensor, is_init: Tensor
@@ -84,10 +85,11 @@ class PlacedMemory(nn.Module):
         fused = self.fusion(torch.cat((feature, proprioception, place.detach()), -1))
         batch = fused.shape[:-1]
         remembered = self.cell(fused.reshape(-1, 32), remembered.reshape(-1, self.hidden_size)).reshape(*batch, -1)
-        latent, logits, said, gains = self.head(remembered).split(self.sizes, -1)
+        known, gains = self.head(remembered).split(self.sizes, -1)
+        latent, logits, said = (known + self.glance(feature)).tensor_split((NUM_TERRAIN_LATENT, -NUM_PLACE), -1)
         gain, switch = (gains + GAIN).sigmoid().split((NUM_PLACE, 1), -1)
         place = torch.lerp(place, torch.cat((place[..., 2:4], place[..., 2:]), -1), switch)
-        place = torch.lerp(place, PLACE_SCALE * said, gain)
+        place = torch.lerp(place, said, gain)
         after = torch.cat((remembered, moved(place, motion)), -1)
         return latent.tanh(), bearings(place), logits, after, place
 

@@ -28,6 +28,9 @@ HEADING_SCALE = 1.5
 HEADING_GATE = 0.6
 """Heading errors beyond this are given, not predicted, while the student is trained [rad] (section 5.9)."""
 
+NUM_FEATURES = 32
+"""Numbers that the depth encoder makes of an image (supplement, section S6)."""
+
 PERCEIVED_HEADING: NestedKey = ("perceived", keys.HEADING_ERROR)
 PERCEIVED_OBSTACLE: NestedKey = ("perceived", keys.OBSTACLE)
 PERCEIVED_PLACE: NestedKey = ("perceived", keys.PLACE)
@@ -110,11 +113,11 @@ class RecurrentStudent(nn.Module):
             "heading_gate": heading_gate,
             **({"period": period} if num_place else {}),
         }
-        self.depth_encoder = DepthEncoder(hidden=encoder_hidden)
+        self.depth_encoder = DepthEncoder(NUM_FEATURES, hidden=encoder_hidden)
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
-        inputs_of_memory = (32 + features.NUM_PROPRIOCEPTION, memory, num_obstacles)
-        self.memory = PlacedMemory(*inputs_of_memory, period) if num_place else Memory(*inputs_of_memory)
+        sizes = (NUM_FEATURES, features.NUM_PROPRIOCEPTION, memory, num_obstacles)
+        self.memory = PlacedMemory(*sizes, period) if num_place else Memory(*sizes)
         self.measured = [keys.PROPRIOCEPTION, *([keys.ESTIMATE] if num_place else [])]
         self.heading_gate = heading_gate
         inputs: dict[NestedKey, int] = {
@@ -147,19 +150,20 @@ class RecurrentStudent(nn.Module):
         """Memory of robots that have not seen anything, ``[N, M]``."""
         return torch.zeros(num_robots, self.memory.size, device=next(self.parameters()).device)
 
-    def policy(self, *, assisted: bool = False, sequence: bool = False) -> TensorDictSequential:
+    def policy(self, *, assisted: bool = False, sequence: bool = False, seen: bool = False) -> TensorDictSequential:
         """The policy, sharing this student's parameters.
 
         Args:
             assisted: take heading errors beyond the gate from ``heading_error``, as in training.
             sequence: for batches ``[T, *B]`` of consecutive steps, time first, instead of one step ``[*B]``; of
                 ``hidden`` only the first step's counts.
+            seen: read the images' ``depth_feature`` instead of the images.
         """
         remember = self.memory if sequence else _OneStep(self.memory)
         perceive = _Perception(self.heading_gate if assisted else None)
         placed = self.settings["num_place"] > 0
         return TensorDictSequential(
-            self.depth_encoder,
+            *([] if seen else [self.depth_encoder]),
             self.estimator,
             TensorDictModule(
                 remember,
@@ -184,7 +188,8 @@ class Memory(nn.Module):
     """Fuse feature and proprioception, remember, and infer terrain latent, heading errors and obstacle.
 
     Args:
-        in_features: of feature and proprioception together.
+        features: of an image.
+        measured: numbers of proprioception.
         hidden_size: units of the GRU.
         num_obstacles: types of obstacles.
 
@@ -192,17 +197,17 @@ class Memory(nn.Module):
         size: of the memory.
 
     Example:
-        >>> memory = Memory(77, 16, 7)
+        >>> memory = Memory(32, 45, 16, 7)
         >>> first = torch.zeros(5, 3, 1, dtype=torch.bool)
         >>> outputs = memory(torch.zeros(5, 3, 32), torch.zeros(5, 3, 45), torch.zeros(5, 3, 16), first)
         >>> [tuple(output.shape) for output in outputs]
         [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 16)]
     """
 
-    def __init__(self, in_features: int, hidden_size: int, num_obstacles: int) -> None:
+    def __init__(self, features: int, measured: int, hidden_size: int, num_obstacles: int) -> None:
         super().__init__()
         self.size = hidden_size
-        self.fusion = mlp(in_features, (128,), 32)
+        self.fusion = mlp(features + measured, (128,), 32)
         self.cell = nn.GRU(32, hidden_size)
         self.sizes = (NUM_TERRAIN_LATENT, NUM_HEADING, num_obstacles)
         self.head = mlp(hidden_size, (), sum(self.sizes))

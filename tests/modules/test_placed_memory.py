@@ -54,7 +54,7 @@ def test_planar_motion_against_quaternions(angles: tuple[float, float]) -> None:
 
 def test_without_gains_it_only_counts_its_way() -> None:
     """Half a turn to the left at 1 m/s in 5 s: a circle whose radius is 5 / pi."""
-    memory = PlacedMemory(77, 8, 7, period=0.05)
+    memory = PlacedMemory(32, 45, 8, 7, period=0.05)
     with torch.no_grad():
         memory.head[0].weight.zero_()
         memory.head[0].bias[-9:] = -100.0
@@ -74,7 +74,7 @@ def test_without_gains_it_only_counts_its_way() -> None:
 
 
 def test_a_switch_puts_the_next_way_point_first_and_a_gain_believes_what_is_said() -> None:
-    memory = PlacedMemory(77, 8, 7, period=0.04)
+    memory = PlacedMemory(32, 45, 8, 7, period=0.04)
     inputs = (torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4))
     hidden = torch.arange(16.0)[None]
     with torch.no_grad():
@@ -83,14 +83,14 @@ def test_a_switch_puts_the_next_way_point_first_and_a_gain_believes_what_is_said
         memory.head[0].bias[-1] = 100.0
         switched = memory.step(*inputs, hidden)[-1]
         memory.head[0].bias[-9:-1] = 100.0
-        memory.head[0].bias[-17:-9] = torch.arange(8.0)
+        memory.head[0].bias[-17:-9] = 2.0 * torch.arange(8.0)
         said = memory.step(*inputs, hidden)[-1]
     torch.testing.assert_close(switched[0], torch.tensor([10.0, 11.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0]))
     torch.testing.assert_close(said[0], 2.0 * torch.arange(8.0))
 
 
 def test_gradients_reach_what_was_said_earlier() -> None:
-    memory = PlacedMemory(77, 8, 7, period=0.04)
+    memory = PlacedMemory(32, 45, 8, 7, period=0.04)
     feature = torch.randn(6, 2, 32, requires_grad=True)
     first = torch.zeros(6, 2, 1, dtype=torch.bool)
     first[3, 0] = True

@@ -112,8 +112,8 @@ def test_imitation_of_one_window_lowers_its_loss(recipe: ModuleType, module: Mod
 
 def test_sixteen_bits_without_byol_from_another_student(recipe: ModuleType, smoke: Any) -> None:
     parent = recipe.train(replace(smoke, iterations=1))
-    nothing = replace(smoke.pretrain, images=0)
-    child = replace(smoke, name="child", init_from=parent, iterations=0, byol=False, bits=16, pretrain=nothing)
+    nothing = replace(smoke.glance, images=0)
+    child = replace(smoke, name="child", init_from=parent, iterations=0, byol=False, bits=16, glance=nothing)
     one, other = (Artifact.load(run / "policy") for run in (parent, recipe.train(child)))
     assert all(torch.equal(other.state[name], value) for name, value in one.state.items())
     assert other.manifest["byol"] is False

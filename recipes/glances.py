@@ -1,0 +1,165 @@
+"""What single images tell: the depth encoder learns from what is asked of each image by itself.
+
+An image is asked for what the teacher's scandots are encoded to, for the obstacle ahead and for the robot's place.
+Consecutive images of a window are nearly the same, and the encoder takes most of an iteration's time: images drawn from
+all that was seen lately teach it as much in a fraction of that, and the imitation then trains memory and actor on
+features alone. Ours: the sources train the encoder from nothing, within the imitation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from tsc_student_config import GlanceConfig
+
+from agility_rl import keys
+from agility_rl.collectors import DAggerCollector
+from agility_rl.envs import AgilityEnv
+from agility_rl.envs.arena import NUM_PLACE
+from agility_rl.envs.obstacles import OBSTACLES
+from agility_rl.go2.camera import dequantize
+from agility_rl.modules import DepthAugmentation, RecurrentStudent, Teacher
+from agility_rl.modules.mlp import mlp
+from agility_rl.modules.placed_memory import PlacedMemory
+from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
+from agility_rl.training import distributed
+from agility_rl.training.seeding import permutation
+
+SIZES = (NUM_TERRAIN_LATENT, len(OBSTACLES), NUM_PLACE)
+ERRORS = ("error_latent", "loss_obstacle", "error_place", "accuracy_obstacle")
+"""What is measured: mean squared error of the latent, cross-entropy, mean absolute error of the place [m], share."""
+Represent = Callable[[Tensor], dict[str, Tensor]]
+"""One step of another loss of the encoder, on stored images."""
+
+
+@dataclass
+class Glances:
+    """What the encoder is asked with, and the images that it is asked about.
+
+    Attributes:
+        encoder: of the student.
+        head: linear, of features; part of a student that infers its place.
+        optimizer: of both.
+        images: those seen lately, in 8 or 16 bits, each with what it should have told.
+        augmentation: disturbs them.
+        generator: draws them.
+    """
+
+    encoder: nn.Module
+    head: nn.Module
+    optimizer: torch.optim.Optimizer
+    images: TensorDictReplayBuffer
+    augmentation: DepthAugmentation
+    generator: torch.Generator
+
+    @classmethod
+    def of(
+        cls, student: RecurrentStudent, cfg: GlanceConfig, augmentation: DepthAugmentation, generator: torch.Generator
+    ) -> Glances:
+        """Of a student."""
+        memory, encoder = student.memory, student.depth_encoder.module
+        device = next(student.parameters()).device
+        head = memory.glance if isinstance(memory, PlacedMemory) else mlp(32, (), sum(SIZES)).to(device)
+        optimizer = torch.optim.Adam([*encoder.parameters(), *head.parameters()], lr=cfg.learning_rate)
+        images = TensorDictReplayBuffer(storage=LazyTensorStorage(cfg.kept), batch_size=cfg.batch)
+        return cls(encoder, head, optimizer, images, augmentation, generator)
+
+    def keep(self, seen: TensorDictBase, teacher: Teacher) -> None:
+        """Remember images ``[*B]``: ``depth``, ``scandots``, ``obstacle`` and ``place``."""
+        self.images.extend(asked(seen, teacher).flatten())
+
+    def learn(self, steps: int, represent: Represent | None = None) -> dict[str, float]:
+        """So many gradient steps on images drawn from those remembered; returns the means of :data:`ERRORS`."""
+        found = []
+        for _ in range(steps):
+            rows = torch.randint(len(self.images), (self.images.batch_size,), generator=self.generator)
+            sample = self.images[rows]
+            errors = self.errors(sample, self.augmentation.augment(dequantize(sample[keys.DEPTH])))
+            self.optimizer.zero_grad(set_to_none=True)
+            total = errors[0] + errors[1] + errors[2]
+            if not bool(total.isfinite()):
+                raise ValueError(f"the encoder's loss is {total.item()}: look for NaN in images and teacher")
+            total.backward()
+            distributed.average_gradients(distributed.optimized(self.optimizer))
+            self.optimizer.step()
+            found.append(torch.stack(errors).detach())
+            if represent is not None and len(rows) > 1:
+                represent(sample[keys.DEPTH])
+        means = torch.stack(found).mean(0).tolist()
+        return {f"glance/{name}": value for name, value in zip(ERRORS, means, strict=True)}
+
+    def errors(self, sample: TensorDictBase, depth: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """:data:`ERRORS` on images ``[M, 58, 87]``."""
+        latent, logits, place = self.head(self.encoder(depth)).split(SIZES, -1)
+        kind = sample[keys.OBSTACLE]
+        error = (latent.tanh() - sample[keys.TERRAIN_LATENT]).square().mean()
+        distance = (place - sample[keys.PLACE]).abs().mean()
+        return (
+            error,
+            nn.functional.cross_entropy(logits, kind),
+            distance,
+            (logits.argmax(-1) == kind).to(distance.dtype).mean(),
+        )
+
+
+@torch.no_grad()
+def asked(seen: TensorDictBase, teacher: Teacher) -> TensorDictBase:
+    """Images with what they should tell: ``terrain_latent`` [*B, 32], ``obstacle`` int64 [*B], ``place`` [*B, 8]."""
+    latent = teacher.scandots_encoder(seen.select(keys.SCANDOTS))[keys.TERRAIN_LATENT]
+    kept = {
+        keys.DEPTH: seen[keys.DEPTH],
+        keys.TERRAIN_LATENT: latent,
+        keys.OBSTACLE: seen[keys.OBSTACLE].argmax(-1),
+        keys.PLACE: seen[keys.PLACE],
+    }
+    return TensorDict(kept, seen.batch_size)
+
+
+@torch.no_grad()
+def collect_images(env: AgilityEnv, teacher: Teacher, cfg: GlanceConfig, bits: int) -> TensorDictBase:
+    """Let the teacher walk and keep every ``every``-th decision's images: :func:`asked`, ``[T, N]``."""
+    # The teacher has no memory: what the collector carries for it is a number that stays what it is.
+    remember = TensorDictModule(nn.Identity(), in_keys=[keys.HIDDEN], out_keys=[("memory", keys.HIDDEN)])
+    walker = DAggerCollector(
+        env,
+        TensorDictSequential(*teacher.privileged_policy(), remember),
+        teacher.privileged_policy(),
+        cfg.every,
+        initial_hidden=torch.zeros(env.num_robots, 1, device=env.device),
+        bits=16 if bits == 16 else 8,
+        keep=(keys.DEPTH, keys.SCANDOTS, keys.OBSTACLE, keys.PLACE),
+    )
+    # A view would keep the whole window.
+    rows = [asked(walker.collect()[0].clone(), teacher) for _ in range(-(-cfg.images // env.num_robots))]
+    return torch.stack(rows)  # type: ignore[return-value, arg-type]
+
+
+def pretrain(
+    glances: Glances, env: AgilityEnv, teacher: Teacher, cfg: GlanceConfig, bits: int, represent: Represent | None
+) -> dict[str, float]:
+    """Collect images where the teacher walks, learn from most robots', measure on the others'.
+
+    Returns:
+        How many, and :data:`ERRORS` of those held out.
+    """
+    images = collect_images(env, teacher, cfg, bits)
+    robots = images.batch_size[1]
+    apart = min(max(1, round(cfg.held_out * robots)), robots - 1)
+    train, test = images[:, apart:].flatten(), images[:, :apart].flatten()
+    glances.images.extend(train[permutation(len(train), glances.generator)])
+    metrics: dict[str, float] = {"pretrain/images": float(len(train))}
+    for epoch in range(cfg.epochs):
+        glances.learn(max(1, len(train) // cfg.batch), represent)
+        with torch.no_grad():
+            pieces = [(len(part), *glances.errors(part, part[keys.DEPTH])) for part in test.split(cfg.batch)]
+        for index, name in enumerate(ERRORS, start=1):
+            metrics[f"pretrain/{name}"] = sum(piece[0] * float(piece[index]) for piece in pieces) / len(test)
+        shown = "  ".join(f"{name} {metrics[f'pretrain/{name}']:.3g}" for name in ERRORS)
+        print(f"pre-training {epoch + 1}/{cfg.epochs} on {len(train)} images; {len(test)} held out: {shown}")
+    return metrics
