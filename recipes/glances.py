@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from tsc_student_config import GlanceConfig
 
 from agility_rl import keys
@@ -38,6 +38,40 @@ Represent = Callable[[Tensor], dict[str, Tensor]]
 """One step of another loss of the encoder, on stored images."""
 
 
+class Newest:
+    """The newest rows of all that were given.
+
+    Attributes:
+        rows: ``[M]``, oldest first; ``None`` before any were given.
+
+    Args:
+        most: M at most.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.rows: TensorDictBase | None = None
+
+    def extend(self, rows: TensorDictBase) -> None:
+        """Add rows ``[K]``, and forget the oldest."""
+        every = rows if self.rows is None else torch.cat((self.rows, rows))  # type: ignore[arg-type]
+        self.rows = every[-self.most :].clone()
+
+    def draw(self, count: int, generator: torch.Generator) -> TensorDictBase:
+        """So many rows; one may come several times."""
+        assert self.rows is not None
+        return self.rows[torch.randint(len(self.rows), (count,), generator=generator)]
+
+    def state_dict(self) -> dict[str, Any]:
+        """The rows, as nested dicts of tensors."""
+        return {} if self.rows is None else {"rows": self.rows.to_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        rows = state.get("rows")
+        self.rows = None if rows is None else TensorDict(rows, [len(rows[keys.DEPTH])])
+
+
 @dataclass
 class Glances:
     """What the encoder is asked with, and the images that it is asked about.
@@ -47,6 +81,7 @@ class Glances:
         head: linear, of features; part of a student that infers its place.
         optimizer: of both.
         images: those seen lately, in 8 or 16 bits, each with what it should have told.
+        batch: so many of them are a step's.
         augmentation: disturbs them.
         generator: draws them.
     """
@@ -54,7 +89,8 @@ class Glances:
     encoder: nn.Module
     head: nn.Module
     optimizer: torch.optim.Optimizer
-    images: TensorDictReplayBuffer
+    images: Newest
+    batch: int
     augmentation: DepthAugmentation
     generator: torch.Generator
 
@@ -67,8 +103,7 @@ class Glances:
         device = next(student.parameters()).device
         head = memory.glance if isinstance(memory, PlacedMemory) else mlp(32, (), sum(SIZES)).to(device)
         optimizer = torch.optim.Adam([*encoder.parameters(), *head.parameters()], lr=cfg.learning_rate)
-        images = TensorDictReplayBuffer(storage=LazyTensorStorage(cfg.kept), batch_size=cfg.batch)
-        return cls(encoder, head, optimizer, images, augmentation, generator)
+        return cls(encoder, head, optimizer, Newest(cfg.kept), cfg.batch, augmentation, generator)
 
     def keep(self, seen: TensorDictBase, teacher: Teacher) -> None:
         """Remember images ``[*B]``: ``depth``, ``scandots``, ``obstacle`` and ``place``."""
@@ -78,8 +113,7 @@ class Glances:
         """So many gradient steps on images drawn from those remembered; returns the means of :data:`ERRORS`."""
         found = []
         for _ in range(steps):
-            rows = torch.randint(len(self.images), (self.images.batch_size,), generator=self.generator)
-            sample = self.images[rows]
+            sample = self.images.draw(self.batch, self.generator)
             errors = self.errors(sample, self.augmentation.augment(dequantize(sample[keys.DEPTH])))
             self.optimizer.zero_grad(set_to_none=True)
             total = errors[0] + errors[1] + errors[2]
@@ -89,7 +123,7 @@ class Glances:
             distributed.average_gradients(distributed.optimized(self.optimizer))
             self.optimizer.step()
             found.append(torch.stack(errors).detach())
-            if represent is not None and len(rows) > 1:
+            if represent is not None and self.batch > 1:
                 represent(sample[keys.DEPTH])
         means = torch.stack(found).mean(0).tolist()
         return {f"glance/{name}": value for name, value in zip(ERRORS, means, strict=True)}

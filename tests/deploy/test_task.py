@@ -35,7 +35,7 @@ def student(request: pytest.FixtureRequest) -> RecurrentStudent:
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():
         for parameter in network.parameters():
-            parameter.copy_(0.2 * torch.randn(parameter.shape, generator=generator))
+            parameter.copy_(0.15 * torch.randn(parameter.shape, generator=generator))
     return network
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from agility_rl import keys
 from agility_rl.deploy.artifact import Artifact
@@ -60,13 +61,15 @@ def test_a_run_writes_a_student_and_what_it_saw(
     assert saved["bbc"] == str(untrained) and saved["env"]["course"] == "bar_jump"
 
 
-def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smoke: Any) -> None:
+@pytest.mark.parametrize("steps", [0, 2], ids=["the imitation teaches the encoder", "glances do"])
+def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smoke: Any, steps: int) -> None:
+    smoke = replace(smoke, glance=replace(smoke.glance, steps=steps))
     whole = recipe.train(replace(smoke, name="whole", iterations=2))
     halves = recipe.train(replace(smoke, name="halves", iterations=1))
     recipe.train(replace(smoke, resume=halves, iterations=2))
     one, other = (Artifact.load(run / "policy").state for run in (whole, halves))
     assert not [name for name in one if not torch.equal(one[name], other[name])]
-    for name in ("loss_behaviour", "loss_byol", "reward", "use/jump"):
+    for name in ("loss_behaviour", "loss_byol", "reward", "use/jump", *(["glance/error_place"] if steps else [])):
         assert torch.equal(read_scalars(whole)[name][1], read_scalars(halves)[name][1]), name
 
 
@@ -93,6 +96,58 @@ def test_what_a_step_moves(recipe: ModuleType, module: Module, smoke: Any) -> No
     recipe.represent_window(parts, cfg, window, 0)
     assert moved() == {"depth_encoder"}
     assert all(torch.equal(value, teacher[name]) for name, value in parts.teacher.state_dict().items())
+    parts.env.close()
+
+
+def test_glances_move_the_encoder_and_the_imitation_the_rest(recipe: ModuleType, module: Module, smoke: Any) -> None:
+    setup = module("tsc_student_setup")
+    own, glance = replace(smoke.imitation, minibatches=1, latent=1.0), replace(smoke.glance, steps=1, every=2)
+    cfg = replace(smoke, imitation=own, glance=glance)
+    parts = setup.build(*setup.resolve(cfg))
+    state = {name: value.clone() for name, value in parts.student.state_dict().items()}
+
+    def moved() -> set[str]:
+        new = parts.student.state_dict()
+        changed = {".".join(name.split(".")[:2]) for name in state if not torch.equal(new[name], state[name])}
+        state.update({name: value.clone() for name, value in new.items()})
+        return changed
+
+    window = parts.collector.collect()
+    feature = parts.student.depth_encoder(window[0].select("depth"))["depth_feature"]
+    torch.testing.assert_close(window["depth_feature"][0], feature)
+    window["label", "terrain_latent"] = parts.teacher.scandots_encoder(window.select("scandots"))["terrain_latent"]
+    recipe.imitate(parts, cfg, window, 0)
+    changed = moved()
+    assert "memory.cell" in changed and "memory.head" in changed and "memory.glance" not in changed
+    assert not any(name.startswith("depth_encoder") for name in changed)
+    parts.glances.keep(window[::2], parts.teacher)
+    assert len(parts.glances.images.rows) == 2 * 4
+    parts.glances.learn(1)
+    assert moved() == {"depth_encoder.module", "memory.glance"}
+    parts.env.close()
+
+
+def test_only_the_newest_images_are_kept(module: Module) -> None:
+    images = module("glances").Newest(5)
+    assert images.state_dict() == {}
+    for first in (0, 3):
+        images.extend(TensorDict({"depth": torch.arange(first, first + 3)}, [3]))
+    assert images.rows["depth"].tolist() == [1, 2, 3, 4, 5]
+    other = module("glances").Newest(5)
+    other.load_state_dict(images.state_dict())
+    one, two = (x.draw(20, torch.Generator().manual_seed(1))["depth"] for x in (images, other))
+    assert torch.equal(one, two) and set(one.tolist()) <= {1, 2, 3, 4, 5}
+
+
+def test_glances_of_the_same_images_lower_their_errors(recipe: ModuleType, module: Module, smoke: Any) -> None:
+    setup = module("tsc_student_setup")
+    nothing = replace(smoke.augmentation, rectangle=0.0, white_noise=0.0, dropout=0.0, blur=0.0)
+    cfg = replace(smoke, augmentation=nothing, precision="float32", glance=replace(smoke.glance, steps=1))
+    parts = setup.build(*setup.resolve(cfg))
+    parts.glances.keep(parts.collector.collect(), parts.teacher)
+    first, last = (parts.glances.learn(20) for _ in range(2))
+    for name in ("error_latent", "loss_obstacle", "error_place"):
+        assert last[f"glance/{name}"] < 0.8 * first[f"glance/{name}"], name
     parts.env.close()
 
 
@@ -178,6 +233,8 @@ def test_the_paper_preset_is_the_papers(module: Module) -> None:
         (("--init-from", "TEACHER"), "expected a student of tsc_student.py, got an artifact of kind 'teacher'"),
         (("--env.course", "nowhere"), "unknown course 'nowhere'; expected one of full"),
         (("--representation.images", "2", "--representation.minibatches", "2"), "BYOL needs 2 images or more, got 1"),
+        (("--glance.batch", "0"), "expected every, epochs, batch and kept above 0"),
+        (("--env.num-robots", "1"), "--glance.images: expected two robots or more"),
         (("--byo",), "did you mean --byol?"),
     ],
 )
