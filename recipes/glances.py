@@ -116,7 +116,7 @@ class Glances:
             sample = self.images.draw(self.batch, self.generator)
             errors = self.errors(sample, self.augmentation.augment(dequantize(sample[keys.DEPTH])))
             self.optimizer.zero_grad(set_to_none=True)
-            total = errors[0] + errors[1] + errors[2]
+            total = errors[0] + errors[1] + NUM_PLACE * errors[2]  # each number of the place counts once
             if not bool(total.isfinite()):
                 raise ValueError(f"the encoder's loss is {total.item()}: look for NaN in images and teacher")
             total.backward()

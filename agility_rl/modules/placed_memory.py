@@ -11,6 +11,8 @@ from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 
 NUM_PLACE = 8
 """Way-point, the next one, and the robot's place at the obstacle (:data:`agility_rl.keys.PLACE`)."""
+GOAL_RADIUS = 0.45
+"""Distance at which a student's way-point is reached [m] (method notes, section 5.5)."""
 GAIN = -1.5
 """Added to the gains' logits: at the start a fifth of what the network says is believed at each decision."""
 
@@ -28,8 +30,8 @@ class PlacedMemory(nn.Module):
               p^+_t = T_{t}^{t + 1/2}\, p_t
 
     T moves a place by half a decision's motion, as gyroscope, attitude and estimated velocity give it
-    (:func:`planar_motion`, :func:`moved`), S puts the next way-point in the first one's place, and the gains k and s in
-    (0, 1) and the place m are read from a GRU, which sees the image's feature, proprioception and
+    (:func:`planar_motion`, :func:`moved`), S puts the next way-point in the first one's place where that one is
+    :func:`reached` or the GRU says so, and the gains k and s in (0, 1) and the place m are read from a GRU, which sees the image's feature, proprioception and
     :math:`\bar p_t`. What the feature says by itself, by a linear map (``glance``), is added to terrain latent,
     obstacle and m. Who has seen nothing has a place of zeros, that no robot can have, since sine and cosine are 0.
 
@@ -87,11 +89,33 @@ class PlacedMemory(nn.Module):
         remembered = self.cell(fused.reshape(-1, 32), remembered.reshape(-1, self.hidden_size)).reshape(*batch, -1)
         known, gains = self.head(remembered).split(self.sizes, -1)
         latent, logits, said = (known + self.glance(feature)).tensor_split((NUM_TERRAIN_LATENT, -NUM_PLACE), -1)
-        gain, switch = (gains + GAIN).sigmoid().split((NUM_PLACE, 1), -1)
+        gain, switch = (gains + GAIN).split((NUM_PLACE, 1), -1)
+        gain, switch = gain.sigmoid(), (switch + reached(place)).sigmoid()
         place = torch.lerp(place, torch.cat((place[..., 2:4], place[..., 2:]), -1), switch)
         place = torch.lerp(place, said, gain)
         after = torch.cat((remembered, moved(place, motion)), -1)
         return latent.tanh(), bearings(place), logits, after, place
+
+
+def reached(place: Tensor) -> Tensor:
+    r"""How much speaks for the next way-point, as a logit.
+
+    .. math:: (0.45 - \| p_{1:2} \|) / 0.04 \quad \text{within} \pm 8
+
+    Source: ours; the radius is that in which a student's way-point is reached (method notes, section 5.5).
+
+    Args:
+        place: ``[*B, 8]``.
+
+    Returns:
+        ``[*B, 1]``, without gradient.
+
+    Example:
+        >>> reached(torch.tensor([0.0, 0.41, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0])).round(decimals=3)
+        tensor([1.])
+    """
+    distance = torch.linalg.vector_norm(place[..., :2].detach(), dim=-1, keepdim=True)
+    return ((GOAL_RADIUS - distance) / 0.04).clamp(-8.0, 8.0)
 
 
 def planar_motion(proprioception: Tensor, estimate: Tensor) -> Tensor:
