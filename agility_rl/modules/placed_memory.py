@@ -30,10 +30,11 @@ class PlacedMemory(nn.Module):
               p^+_t = T_{t}^{t + 1/2}\, p_t
 
     T moves a place by half a decision's motion, as gyroscope, attitude and estimated velocity give it
-    (:func:`planar_motion`, :func:`moved`), S puts the next way-point in the first one's place where that one is
-    :func:`reached` or the GRU says so, and the gains k and s in (0, 1) and the place m are read from a GRU, which sees the image's feature, proprioception and
-    :math:`\bar p_t`. What the feature says by itself, by a linear map (``glance``), is added to terrain latent,
-    obstacle and m. Who has seen nothing has a place of zeros, that no robot can have, since sine and cosine are 0.
+    (:func:`planar_motion`, :func:`moved`). S puts the next way-point in the first one's place, where that one is
+    :func:`reached` or the GRU says so. The gains k and s in (0, 1) and the place m are read from a GRU, which sees the
+    image's feature, proprioception and :math:`\bar p_t`. What the feature says by itself, by a linear map (``glance``),
+    is added to terrain latent, obstacle and m. Who has seen nothing has a place of zeros, that no robot can have, since
+    sine and cosine are 0.
 
     Source: ours; prediction and correction are those of a Kalman filter (Kalman 1960, doi:10.1115/1.3662552). Sizes of
     fusion and GRU: method notes, section 5.9.
