@@ -20,6 +20,7 @@ from agility_rl.envs.layout import CourseLayout
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.envs.rewards import COLLISION_FORCE
 from agility_rl.go2 import constants
+from agility_rl.simulation import Simulator
 
 COLLIDING = (*constants.THIGH_GROUPS, *constants.CALF_GROUPS)
 TIME, WALKED_AROUND = "time", "walked around"
@@ -32,8 +33,9 @@ class Episode:
 
     Attributes:
         start: ``[3]``, where the trunk was before the first step [m].
-        steps: ``[T]`` control steps: ``position`` [T, 3] after the step [m], ``behaviour`` and ``obstacle`` (type)
-            int64 [T], ``touching`` bool [T, 8], thighs and calves.
+        steps: ``[T]`` control steps: ``position`` [T, 3] after the step [m], ``pose`` [T, 16 + H], quaternion, joints
+            and the course's hinges [rad], ``behaviour`` and ``obstacle`` (type) int64 [T], ``touching`` bool [T, 8],
+            thighs and calves.
         passed, bypassed, failed: int64 ``[7]``, how often each type of obstacle was.
         cause: why it was no success; empty for a success.
         layout: the course as it was drawn, for :class:`CourseLayout`, one row.
@@ -62,6 +64,11 @@ class Episode:
         touching = self.steps["touching"]
         before = torch.cat((torch.zeros_like(touching[:1]), touching[:-1]))
         return touching & ~before
+
+
+def pose_of(simulator: Simulator) -> Tensor:
+    """Quaternion, joint angles and the hinges of the course [rad], ``[N, 16 + H]``."""
+    return torch.cat((simulator.root_quaternion, simulator.joint_position, simulator.hinge_angle), -1)
 
 
 def record_episodes(
@@ -110,6 +117,7 @@ def record_episodes(
             senses.advance()
         step = {
             "position": env.simulator.root_position.clone(),
+            "pose": pose_of(env.simulator),
             "behaviour": held[keys.BEHAVIOUR].clone(),
             "obstacle": kind,
             "touching": env.simulator.contact_force[:, list(COLLIDING)] > COLLISION_FORCE,

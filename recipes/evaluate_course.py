@@ -9,6 +9,7 @@ Out: tables on the screen, ``RUN/course_evaluation.json``, ``RUN/figures/course_
     python recipes/evaluate_course.py --script trot:1.2 --course each --episodes 50
     python recipes/evaluate_course.py --script trot:1.2,bar_jump=jump:1.4 --course bar_jump
     python recipes/evaluate_course.py --script guide --bbc pretrained/bbc_guided --course each full
+    MUJOCO_GL=egl python recipes/evaluate_course.py runs/my_teacher --strip  # pictures of a whole course
     python recipes/evaluate_course.py runs/my_student --disturbance all  # rectangles, noise, ..., a late camera
 
 Courses: a preset, a .toml or .json file, ``each`` for every obstacle of the challenge alone, or ``targets``.
@@ -30,6 +31,7 @@ import tyro
 from course_judgement import behaviour_seconds, print_courses, summarise, targets
 from course_pictures import typical, view
 from course_rollouts import Episode, record_episodes, shares
+from course_strip import course_strip
 from deciders import Decider, load_decider, load_script
 from disturbances import DISTURBANCES, Disturbance, chosen
 from judgement import to_json
@@ -94,6 +96,8 @@ class Config:
     """Seed of courses and start places; training draws its own from another generator, so none of them was seen."""
     num_threads: int | None = None
     """Threads of the simulator."""
+    strip: bool = False
+    """Render the successful episode of median time: before, on and behind every obstacle (``MUJOCO_GL=egl``)."""
     output: Path | None = None
     """Folder of the results; by default the run, for a script ``runs/script_BEHAVIOUR_SPEED``."""
 
@@ -153,6 +157,18 @@ def check(config: Config) -> None:
         raise ValueError("--behaviours limits a teacher or student; a script says itself which it chooses")
 
 
+def draw_strip(course: Course, episodes: Sequence[Episode], file: Path, console: Console) -> None:
+    """Render the successful episode of median time, where there is one and this machine can."""
+    successes = [episode for episode in typical(episodes) if episode.success]
+    if not successes:
+        console.print(f"{course.name}: no episode succeeded, so there is none to render")
+        return
+    try:
+        save_figure(course_strip(course, successes[0]), file)
+    except Exception as error:  # whatever a graphics driver may raise: the evaluation is worth more
+        console.print(f"{file} was not rendered: {type(error).__name__}: {error}; try MUJOCO_GL=egl")
+
+
 def evaluate(config: Config, console: Console) -> dict[str, Any]:
     """The whole evaluation; writes it and returns it."""
     check(config)
@@ -179,6 +195,8 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
             found[label] = summarise(course, episodes)
             figure = plan_view([view(course, episode, config.goal_radius) for episode in typical(episodes)])
             save_figure(figure, output / "figures" / f"course_{file}.png")
+            if config.strip:
+                draw_strip(course, episodes, output / "figures" / f"course_{file}_strip.png", console)
             seconds = behaviour_seconds(episodes)
             for index, obstacle in enumerate(OBSTACLES):
                 if seconds[index].sum() > 0.0:
