@@ -60,7 +60,7 @@ class Newest:
     def draw(self, count: int, generator: torch.Generator) -> TensorDictBase:
         """So many rows; one may come several times."""
         assert self.rows is not None
-        return self.rows[torch.randint(len(self.rows), (count,), generator=generator)]
+        return self.rows[torch.randint(len(self.rows), (count,), generator=generator, device=generator.device)]
 
     def state_dict(self) -> dict[str, Any]:
         """The rows, as nested dicts of tensors."""
