@@ -25,6 +25,7 @@ from agility_rl.collectors import DAggerCollector
 from agility_rl.deploy.artifact import Artifact, ArtifactError, build_manifest
 from agility_rl.deploy.task import describe_camera
 from agility_rl.envs import AgilityEnv
+from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import features
 from agility_rl.losses import BYOLLoss, StudentLoss
 from agility_rl.modules import BYOL, DepthAugmentation, RecurrentStudent, Teacher
@@ -129,6 +130,7 @@ def build(cfg: Config, trained: Trained) -> Components:
         encoder_hidden=cfg.encoder_hidden,
         heading_gate=cfg.heading_gate,
         period=env.dt * env.decision_steps,
+        way_points=[[list(point) for point in kind.way_points] for kind in OBSTACLES.values()],
     ).to(device)
     student.estimator.requires_grad_(False)  # it estimates what can be measured: imitation shall not bend it
     # A tenth to a third less time for the convolutions on a CPU.

@@ -33,7 +33,9 @@ class PlacedMemory(nn.Module):
     (:func:`planar_motion`, :func:`moved`). S puts the next way-point in the first one's place, where that one is
     :func:`reached` or the GRU says so. The gains k and s in (0, 1) and the place m are read from a GRU, which sees the
     image's feature, proprioception and :math:`\bar p_t`. What the feature says by itself, by a linear map (``glance``),
-    is added to terrain latent, obstacle and m. Who has seen nothing has a place of zeros, that no robot can have, since
+    is added to terrain latent, obstacle and m. For the way-points m is a mean of what was said and of those of the
+    likeliest obstacle as they lie from its place (:func:`seen_from`), with shares that the GRU gives. Who has seen
+    nothing has a place of zeros, that no robot can have, since
     sine and cosine are 0.
 
     Source: ours; prediction and correction are those of a Kalman filter (Kalman 1960, doi:10.1115/1.3662552). Sizes of
@@ -45,24 +47,37 @@ class PlacedMemory(nn.Module):
         hidden_size: units of the GRU.
         num_obstacles: types of obstacles.
         period: of a decision [s].
+        way_points: ``[K, W, 2]``, of every type of obstacle, in its frame [m].
 
     Attributes:
         size: of the memory: units of the GRU, and the place after half a decision more.
 
     Example:
-        >>> memory = PlacedMemory(32, 45, 16, 7, 0.04)
+        >>> memory = PlacedMemory(32, 45, 16, 7, 0.04, torch.zeros(7, 4, 2))
         >>> outputs = memory(torch.zeros(5, 3, 32), torch.zeros(5, 3, 45), torch.zeros(5, 3, 4),
         ...     torch.zeros(5, 3, 24), torch.zeros(5, 3, 1, dtype=torch.bool))
         >>> [tuple(output.shape) for output in outputs]
         [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 24), (5, 3, 8)]
     """
 
-    def __init__(self, features: int, measured: int, hidden_size: int, num_obstacles: int, period: float) -> None:
+    way_points: Tensor
+
+    def __init__(
+        self,
+        features: int,
+        measured: int,
+        hidden_size: int,
+        num_obstacles: int,
+        period: float,
+        way_points: Tensor,
+    ) -> None:
         super().__init__()
         self.size, self.hidden_size, self.period = hidden_size + NUM_PLACE, hidden_size, period
         self.fusion = mlp(features + measured + NUM_PLACE, (128,), 32)
         self.cell = nn.GRUCell(32, hidden_size)
-        self.sizes = (NUM_TERRAIN_LATENT + num_obstacles + NUM_PLACE, NUM_PLACE + 1)
+        self.register_buffer("way_points", way_points, persistent=False)
+        shares = 2 * (way_points.shape[1] + 1)
+        self.sizes = (NUM_TERRAIN_LATENT + num_obstacles + NUM_PLACE, NUM_PLACE + 1, shares)
         self.head = mlp(hidden_size, (), sum(self.sizes))
         self.glance = mlp(features, (), self.sizes[0])
 
@@ -88,14 +103,56 @@ class PlacedMemory(nn.Module):
         fused = self.fusion(torch.cat((feature, proprioception, place.detach()), -1))
         batch = fused.shape[:-1]
         remembered = self.cell(fused.reshape(-1, 32), remembered.reshape(-1, self.hidden_size)).reshape(*batch, -1)
-        known, gains = self.head(remembered).split(self.sizes, -1)
+        known, gains, shares = self.head(remembered).split(self.sizes, -1)
         latent, logits, said = (known + self.glance(feature)).tensor_split((NUM_TERRAIN_LATENT, -NUM_PLACE), -1)
         gain, switch = (gains + GAIN).split((NUM_PLACE, 1), -1)
         gain, switch = gain.sigmoid(), (switch + reached(place)).sigmoid()
         place = torch.lerp(place, torch.cat((place[..., 2:4], place[..., 2:]), -1), switch)
-        place = torch.lerp(place, said, gain)
+        obstacle = torch.lerp(place[..., 4:], said[..., 4:], gain[..., 4:])
+        candidates = seen_from(obstacle, self.way_points[logits.argmax(-1)])
+        goals = torch.lerp(place[..., :4], chosen(shares, candidates, said[..., :4]), gain[..., :4])
+        place = torch.cat((goals, obstacle), -1)
         after = torch.cat((remembered, moved(place, motion)), -1)
         return latent.tanh(), bearings(place), logits, after, place
+
+
+def seen_from(obstacle: Tensor, points: Tensor) -> Tensor:
+    """Points of an obstacle's frame in the frame of a robot there.
+
+    Args:
+        obstacle: ``[*B, 4]``: x, y [m], sine and cosine of the robot's yaw, in the obstacle's frame.
+        points: ``[*B, W, 2]`` [m].
+
+    Returns:
+        ``[*B, W, 2]``, ahead and to the left [m].
+
+    Example:
+        >>> seen_from(torch.tensor([-2.0, 0.0, 1.0, 0.0]), torch.tensor([[1.0, 0.5]]))  # turned to the left
+        tensor([[ 0.5000, -3.0000]])
+    """
+    x, y = (points - obstacle[..., None, :2]).unbind(-1)
+    sine, cosine = obstacle[..., None, 2], obstacle[..., None, 3]
+    return torch.stack((cosine * x + sine * y, cosine * y - sine * x), -1)
+
+
+def chosen(shares: Tensor, candidates: Tensor, said: Tensor) -> Tensor:
+    """The way-point and the next one, means of candidates and of what was said.
+
+    Args:
+        shares: ``[*B, 2 (W + 1)]``, logits; those of what was said come last.
+        candidates: ``[*B, W, 2]`` [m].
+        said: ``[*B, 4]`` [m].
+
+    Returns:
+        ``[*B, 4]`` [m].
+
+    Example:
+        >>> candidates, said = torch.tensor([[1.0, 0.0], [2.0, 0.0]]), torch.tensor([0.0, 0.0, 0.0, 7.0])
+        >>> chosen(torch.tensor([99.0, 0.0, 0.0, 0.0, 0.0, 99.0]), candidates, said).round(decimals=3)
+        tensor([1., 0., 0., 7.])
+    """
+    weights = shares.unflatten(-1, (2, -1)).softmax(-1)  # [*B, 2, W + 1]
+    return (weights[..., :-1] @ candidates + weights[..., -1:] * said.unflatten(-1, (2, 2))).flatten(-2)
 
 
 def reached(place: Tensor) -> Tensor:

@@ -70,9 +70,10 @@ class RecurrentStudent(nn.Module):
         encoder_hidden: units of the depth encoder's hidden linear layer.
         heading_gate: see :data:`HEADING_GATE`.
         period: of a decision [s]; who infers the place counts what it has gone meanwhile.
+        way_points: ``[K][W][2]``, of every type of obstacle in its frame [m]; who infers the place knows them.
 
     Raises:
-        ValueError: if ``num_place`` is another number.
+        ValueError: if ``num_place`` is another number, or obstacles lack way-points.
 
     Example:
         >>> from tensordict import TensorDict
@@ -97,10 +98,13 @@ class RecurrentStudent(nn.Module):
         encoder_hidden: int = 128,
         heading_gate: float = HEADING_GATE,
         period: float = constants.CONTROL_DT,
+        way_points: Sequence[Sequence[Sequence[float]]] = (),
     ) -> None:
         super().__init__()
         if num_place not in (0, NUM_PLACE):
             raise ValueError(f"num_place must be 0 or {NUM_PLACE}, got {num_place}")
+        if num_place and len(way_points) != num_obstacles:
+            raise ValueError(f"expected way_points of {num_obstacles} types of obstacles, got {len(way_points)}")
         self.settings: dict[str, Any] = {
             "num_obstacles": num_obstacles,
             "hidden": list(hidden),
@@ -111,13 +115,13 @@ class RecurrentStudent(nn.Module):
             "memory": memory,
             "encoder_hidden": encoder_hidden,
             "heading_gate": heading_gate,
-            **({"period": period} if num_place else {}),
+            **({"period": period, "way_points": way_points} if num_place else {}),
         }
         self.depth_encoder = DepthEncoder(NUM_FEATURES, hidden=encoder_hidden)
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
         sizes = (NUM_FEATURES, features.NUM_PROPRIOCEPTION, memory, num_obstacles)
-        self.memory = PlacedMemory(*sizes, period) if num_place else Memory(*sizes)
+        self.memory = PlacedMemory(*sizes, period, torch.tensor(way_points)) if num_place else Memory(*sizes)
         self.measured = [keys.PROPRIOCEPTION, *([keys.ESTIMATE] if num_place else [])]
         self.heading_gate = heading_gate
         inputs: dict[NestedKey, int] = {
