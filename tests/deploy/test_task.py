@@ -27,11 +27,15 @@ from agility_rl.go2 import features
 from agility_rl.modules import RecurrentStudent
 from agility_rl.modules.student import NEXT_HIDDEN
 
+POINTS = [[[x, 0.0] for x in (-1.5, -0.5, 0.5, 1.5)] for _ in range(7)]
+
 
 @pytest.fixture(params=[0, 8], ids=["headings only", "place"])
 def student(request: pytest.FixtureRequest) -> RecurrentStudent:
     """Random weights, biases included."""
-    network = RecurrentStudent(hidden=(32, 16), num_place=request.param, memory=24, encoder_hidden=16)
+    network = RecurrentStudent(
+        hidden=(32, 16), num_place=request.param, memory=24, encoder_hidden=16, way_points=POINTS
+    )
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():
         for parameter in network.parameters():

@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from agility_rl.go2 import features
-from agility_rl.modules.placed_memory import PlacedMemory, bearings, moved, planar_motion
+from agility_rl.modules.placed_memory import PlacedMemory, bearings, chosen, moved, planar_motion, seen_from
 from agility_rl.rotations import from_euler, rotate
+
+POINTS = torch.tensor([-1.5, -0.5, 0.5, 1.5])[:, None] * torch.tensor([1.0, 0.0]).expand(7, 1, 2)
 
 
 def place_of(position: torch.Tensor, yaw: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
@@ -54,10 +56,10 @@ def test_planar_motion_against_quaternions(angles: tuple[float, float]) -> None:
 
 def test_without_gains_it_only_counts_its_way() -> None:
     """Half a turn to the left at 1 m/s in 5 s: a circle whose radius is 5 / pi."""
-    memory = PlacedMemory(32, 45, 8, 7, period=0.05)
+    memory = PlacedMemory(32, 45, 8, 7, 0.05, POINTS)
     with torch.no_grad():
         memory.head[0].weight.zero_()
-        memory.head[0].bias[-9:] = -100.0
+        memory.head[0].bias[-19:-10] = -100.0
     steps = 100
     proprioception, estimate = torch.zeros(steps, 1, 45), torch.zeros(steps, 1, 4)
     proprioception[..., 4] = math.pi / 5.0 * features.ANGULAR_VELOCITY_SCALE
@@ -74,23 +76,50 @@ def test_without_gains_it_only_counts_its_way() -> None:
 
 
 def test_a_switch_puts_the_next_way_point_first_and_a_gain_believes_what_is_said() -> None:
-    memory = PlacedMemory(32, 45, 8, 7, period=0.04)
+    memory = PlacedMemory(32, 45, 8, 7, 0.04, POINTS)
     inputs = (torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4))
     hidden = torch.arange(16.0)[None]
     with torch.no_grad():
         memory.head[0].weight.zero_()
-        memory.head[0].bias[-9:-1] = -100.0
-        memory.head[0].bias[-1] = 100.0
+        memory.head[0].bias[-19:-11] = -100.0
+        memory.head[0].bias[-11] = 100.0
         switched = memory.step(*inputs, hidden)[-1]
-        memory.head[0].bias[-9:-1] = 100.0
-        memory.head[0].bias[-17:-9] = 2.0 * torch.arange(8.0)
+        memory.head[0].bias[-19:-11] = 100.0
+        memory.head[0].bias[-27:-19] = 2.0 * torch.arange(8.0)
+        memory.head[0].bias[[-6, -1]] = 100.0
         said = memory.step(*inputs, hidden)[-1]
     torch.testing.assert_close(switched[0], torch.tensor([10.0, 11.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0]))
     torch.testing.assert_close(said[0], 2.0 * torch.arange(8.0))
 
 
+def test_way_points_of_an_obstacle_lie_where_its_place_says() -> None:
+    """Turned by 0.8 at (0.4, -0.7): the same as by complex numbers; shares mix them with what was said."""
+    points, position, yaw = torch.tensor([[2.0, 1.0], [-1.0, 3.0]]), torch.tensor([0.4, -0.7]), torch.tensor(0.8)
+    place = place_of(position, yaw, points)
+    candidates = seen_from(place[4:], points)
+    torch.testing.assert_close(candidates.flatten(), place[:4])
+    shares = torch.tensor([[1.0, 2.0, 1.0], [0.0, 1.0, 3.0]])
+    found = chosen(shares.log().flatten(), candidates, torch.full((4,), 5.0)).unflatten(0, (2, 2))
+    torch.testing.assert_close(found[0], 0.25 * candidates[0] + 0.5 * candidates[1] + 0.25 * 5.0)
+    torch.testing.assert_close(found[1], 0.25 * candidates[1] + 0.75 * 5.0)
+
+
+def test_way_points_are_those_of_the_likeliest_obstacle() -> None:
+    points = POINTS.clone()
+    points[3] += 1.0
+    memory = PlacedMemory(32, 45, 8, 7, 0.04, points)
+    with torch.no_grad():
+        memory.head[0].weight.zero_()
+        memory.head[0].bias[32 + 3] = 9.0  # its type
+        memory.head[0].bias[-19:-11] = 100.0  # believed is what was said of the place at the obstacle,
+        memory.head[0].bias[-27:-19] = torch.tensor([9.0, 9.0, 9.0, 9.0, -2.0, 0.0, 0.0, 1.0])
+        memory.head[0].bias[[-10, -4]] = 100.0  # and the first and second way-point of it
+        place = memory.step(torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4), torch.zeros(1, 16))[-1]
+    torch.testing.assert_close(place[0], torch.tensor([1.5, 1.0, 2.5, 1.0, -2.0, 0.0, 0.0, 1.0]))
+
+
 def test_gradients_reach_what_was_said_earlier() -> None:
-    memory = PlacedMemory(32, 45, 8, 7, period=0.04)
+    memory = PlacedMemory(32, 45, 8, 7, 0.04, POINTS)
     feature = torch.randn(6, 2, 32, requires_grad=True)
     first = torch.zeros(6, 2, 1, dtype=torch.bool)
     first[3, 0] = True

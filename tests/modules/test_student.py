@@ -10,11 +10,12 @@ from agility_rl.modules import RecurrentStudent, Teacher
 
 M = 16
 """Units of memory in the tests."""
+WAY_POINTS = [[[x, 0.0] for x in (-1.5, -0.5, 0.5, 1.5)] for _ in range(7)]
 
 
 @pytest.fixture(params=[0, 8], ids=["headings only", "place"])
 def either(request: pytest.FixtureRequest) -> RecurrentStudent:
-    return RecurrentStudent(num_place=request.param, memory=M)
+    return RecurrentStudent(num_place=request.param, memory=M, way_points=WAY_POINTS)
 
 
 @pytest.fixture
@@ -51,9 +52,9 @@ def test_sizes_are_those_of_the_supplement() -> None:
     assert [p.shape[0] for p in student.memory.fusion.parameters() if p.dim() == 2] == [128, 32]
     assert student.memory.fusion[0].in_features == 32 + 45
     assert student.memory.head[0].out_features == 32 + 2 + 7
-    placed = RecurrentStudent(num_place=8).memory
+    placed = RecurrentStudent(num_place=8, way_points=WAY_POINTS).memory
     assert (placed.cell.input_size, placed.cell.hidden_size, placed.size) == (32, 512, 520)
-    assert placed.head[0].out_features == 32 + 7 + 8 + 9
+    assert placed.head[0].out_features == 32 + 7 + 8 + 9 + 2 * 5
 
 
 def test_shapes_and_keys(student: RecurrentStudent) -> None:
@@ -148,7 +149,7 @@ def test_from_a_teacher() -> None:
 def test_from_a_teacher_that_reads_its_place() -> None:
     """The student guesses the place, and does what the teacher does where the guess is right."""
     teacher = Teacher(hidden=(32, 16), num_place=8)
-    student = RecurrentStudent.from_teacher(teacher, memory=M)
+    student = RecurrentStudent.from_teacher(teacher, memory=M, way_points=WAY_POINTS)
     assert student.settings["num_place"] == 8 and "place" not in student.policy(assisted=True).in_keys
     td = steps(1, 3, M + 8)[0].update({"obstacle": torch.eye(7)[:3], "scandots": torch.randn(3, 132)})
     seen = student.policy()(td.clone())
@@ -163,13 +164,20 @@ def test_from_a_teacher_that_reads_its_place() -> None:
         assert not torch.allclose(student.actor(known)["loc"], expected["loc"])
 
 
+def test_who_infers_a_place_knows_the_obstacles() -> None:
+    with pytest.raises(ValueError, match="expected way_points of 7 types of obstacles, got 0"):
+        RecurrentStudent(num_place=8)
+    with pytest.raises(ValueError, match="num_place must be 0 or 8, got 3"):
+        RecurrentStudent(num_place=3)
+
+
 def test_imitation_does_not_push_the_place() -> None:
-    student = RecurrentStudent(memory=M, num_place=8)
+    student = RecurrentStudent(memory=M, num_place=8, way_points=WAY_POINTS)
     td = student.policy(sequence=True)(steps(3, 2, M + 8))
     td["loc"].sum().backward(retain_graph=True)
     assert student.memory.head[0].weight.grad[32:].abs().sum() == 0
     td["place_estimate"].sum().backward()
-    assert (student.memory.head[0].weight.grad[-17:].abs().sum(1) > 0).all()
+    assert (student.memory.head[0].weight.grad[-27:].abs().sum(1) > 0).all()
     assert not td["heading_estimate"].requires_grad
 
 
