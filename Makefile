@@ -27,7 +27,7 @@ $(READY): pyproject.toml constraints.txt
 quickstart: setup
 	$(PYTHON) recipes/bbc_pretrain.py quickstart --name $(NAME)
 	$(PYTHON) recipes/evaluate.py runs/$(NAME)
-	$(PYTHON) recipes/evaluate_course.py pretrained/student --course full each --episodes 20 --episode-length 30 --output runs/$(NAME)/course
+	$(PYTHON) recipes/evaluate_course.py pretrained/student_leaping --course full each --episodes 20 --episode-length 30 --output runs/$(NAME)/course
 	$(PYTHON) recipes/report.py runs/$(NAME)
 	@echo "report: $(CURDIR)/runs/$(NAME)/report.html"
 

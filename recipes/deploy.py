@@ -11,7 +11,7 @@ Out: one MCAP file that opens in Foxglove and rerun, and is a robot log for reci
     python recipes/deploy.py exported/bbc --transport dds --interface eth0     # a real one: docs/deployment.md first
     python recipes/deploy.py pretrained/bbc --transport lcm                    # a simulated robot, over LCM
     python recipes/deploy.py pretrained/bbc --operator terminal                # drive it by hand
-    python recipes/deploy.py pretrained/bbc_course --task pretrained/student --course full
+    python recipes/deploy.py pretrained/bbc_leaping --task pretrained/student_leaping --course full
 
 Status: 0 if all went well, 1 if a fault ended the run or it never began.
 """

@@ -8,7 +8,7 @@ Out: nothing but what there is to see. For an episode and pictures: recipes/perf
 
     python recipes/play.py
     python recipes/play.py runs/my_run --course bidirectional
-    python recipes/play.py pretrained/bbc_course --task pretrained/student --course full  # keys correct it
+    python recipes/play.py pretrained/bbc_leaping --task pretrained/student_leaping --course full  # keys correct it
     python recipes/play.py --operator gamepad         # sticks steer, the browser shows
     python recipes/play.py --operator terminal        # keys in the terminal, no browser: for machines without one
 """
