@@ -66,10 +66,11 @@ class StudentNetwork(nn.Module):
             **known,
             PERCEIVED_HEADING: heading,
             PERCEIVED_OBSTACLE: nn.functional.one_hot(obstacle.argmax(-1), obstacle.shape[-1]).to(obstacle.dtype),
-            **dict(zip((PERCEIVED_PLACE,), places, strict=False)),
             keys.TERRAIN_LATENT: latent,
             keys.LATENT: self.history_encoder(history),
         }
+        if places:
+            inputs[PERCEIVED_PLACE] = places[0]
         logits, parameters, _ = self.actor(*(inputs[name] for name in self.order))
         return logits, parameters, heading, obstacle, after
 
