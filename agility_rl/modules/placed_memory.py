@@ -11,7 +11,7 @@ from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 
 NUM_PLACE = 8
 """Way-point, the next one, and the robot's place at the obstacle (:data:`agility_rl.keys.PLACE`)."""
-GOAL_RADIUS = 0.45
+REACHED = 0.45
 """Distance at which a student's way-point is reached [m] (method notes, section 5.5)."""
 GAIN = -1.5
 """Added to the gains' logits: at the start a fifth of what the network says is believed at each decision."""
@@ -34,9 +34,8 @@ class PlacedMemory(nn.Module):
     :func:`reached` or the GRU says so. The gains k and s in (0, 1) and the place m are read from a GRU, which sees the
     image's feature, proprioception and :math:`\bar p_t`. What the feature says by itself, by a linear map (``glance``),
     is added to terrain latent, obstacle and m. For the way-points m is a mean of what was said and of those of the
-    likeliest obstacle as they lie from its place (:func:`seen_from`), with shares that the GRU gives. Who has seen
-    nothing has a place of zeros, that no robot can have, since
-    sine and cosine are 0.
+    likeliest obstacle as they lie from its place (:func:`seen_from`), with shares that the GRU gives (:func:`chosen`).
+    Who has seen nothing has a place of zeros, that no robot can have, since sine and cosine are 0.
 
     Source: ours; prediction and correction are those of a Kalman filter (Kalman 1960, doi:10.1115/1.3662552). Sizes of
     fusion and GRU: method notes, section 5.9.
@@ -119,6 +118,8 @@ class PlacedMemory(nn.Module):
 def seen_from(obstacle: Tensor, points: Tensor) -> Tensor:
     """Points of an obstacle's frame in the frame of a robot there.
 
+    Source: ours; a shift and a turn of the plane.
+
     Args:
         obstacle: ``[*B, 4]``: x, y [m], sine and cosine of the robot's yaw, in the obstacle's frame.
         points: ``[*B, W, 2]`` [m].
@@ -136,7 +137,11 @@ def seen_from(obstacle: Tensor, points: Tensor) -> Tensor:
 
 
 def chosen(shares: Tensor, candidates: Tensor, said: Tensor) -> Tensor:
-    """The way-point and the next one, means of candidates and of what was said.
+    r"""The way-point and the next one, means of candidates and of what was said.
+
+    .. math:: g_i = \sum_w a_{iw} c_w + a_{i, W + 1}\, m_i, \qquad a_i = \mathrm{softmax}(\ell_i)
+
+    Source: ours.
 
     Args:
         shares: ``[*B, 2 (W + 1)]``, logits; those of what was said come last.
@@ -173,7 +178,7 @@ def reached(place: Tensor) -> Tensor:
         tensor([1.])
     """
     distance = torch.linalg.vector_norm(place[..., :2].detach(), dim=-1, keepdim=True)
-    return ((GOAL_RADIUS - distance) / 0.04).clamp(-8.0, 8.0)
+    return ((REACHED - distance) / 0.04).clamp(-8.0, 8.0)
 
 
 def planar_motion(proprioception: Tensor, estimate: Tensor) -> Tensor:
@@ -239,6 +244,8 @@ def moved(place: Tensor, motion: Tensor) -> Tensor:
 
 def bearings(place: Tensor) -> Tensor:
     """Heading errors to the way-points of a place ``[*B, 8]``, ``[*B, 2]`` [rad]; without gradient.
+
+    Source: definition of the heading error (method notes, section 5.5).
 
     Example:
         >>> bearings(torch.tensor([1.0, 1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
