@@ -16,6 +16,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
+from training_run import finite
 from tsc_student_config import GlanceConfig
 
 from agility_rl import keys
@@ -41,6 +42,8 @@ Represent = Callable[[Tensor], dict[str, Tensor]]
 class Newest:
     """The newest rows of all that were given.
 
+    A replay buffer of torchrl that holds nothing cannot be saved, and a run is saved before it has seen anything.
+
     Attributes:
         rows: ``[M]``, oldest first; ``None`` before any were given.
 
@@ -54,8 +57,12 @@ class Newest:
 
     def extend(self, rows: TensorDictBase) -> None:
         """Add rows ``[K]``, and forget the oldest."""
-        every = rows if self.rows is None else torch.cat((self.rows, rows))  # type: ignore[arg-type]
-        self.rows = every[-self.most :].clone()
+        rows = rows[-self.most :]
+        left = self.most - len(rows)
+        if self.rows is None or left == 0:
+            self.rows = rows.clone()
+        else:
+            self.rows = torch.cat((self.rows[-left:], rows))  # type: ignore[arg-type]
 
     def draw(self, count: int, generator: torch.Generator) -> TensorDictBase:
         """So many rows; one may come several times."""
@@ -105,11 +112,7 @@ class Glances:
         optimizer = torch.optim.Adam([*encoder.parameters(), *head.parameters()], lr=cfg.learning_rate)
         return cls(encoder, head, optimizer, Newest(cfg.kept), cfg.batch, augmentation, generator)
 
-    def keep(self, seen: TensorDictBase, teacher: Teacher) -> None:
-        """Remember images ``[*B]``: ``depth``, ``scandots``, ``obstacle`` and ``place``."""
-        self.images.extend(asked(seen, teacher).flatten())
-
-    def learn(self, steps: int, represent: Represent | None = None) -> dict[str, float]:
+    def learn(self, steps: int, iteration: int, represent: Represent | None = None) -> dict[str, float]:
         """So many gradient steps on images drawn from those remembered; returns the means of :data:`ERRORS`."""
         found = []
         for _ in range(steps):
@@ -117,9 +120,7 @@ class Glances:
             errors = self.errors(sample, self.augmentation.augment(dequantize(sample[keys.DEPTH])))
             self.optimizer.zero_grad(set_to_none=True)
             total = errors[0] + errors[1] + NUM_PLACE * errors[2]  # each number of the place counts once
-            if not bool(total.isfinite()):
-                raise ValueError(f"the encoder's loss is {total.item()}: look for NaN in images and teacher")
-            total.backward()
+            finite(total, "the encoder", iteration).backward()
             distributed.average_gradients(distributed.optimized(self.optimizer))
             self.optimizer.step()
             found.append(torch.stack(errors).detach())
@@ -143,9 +144,14 @@ class Glances:
 
 
 @torch.no_grad()
-def asked(seen: TensorDictBase, teacher: Teacher) -> TensorDictBase:
+def known_terrain(teacher: Teacher, seen: TensorDictBase) -> Tensor:
+    """What a teacher encodes the ``scandots`` [*B, 132] of observations to, ``[*B, 32]``."""
+    latent: Tensor = teacher.scandots_encoder(seen.select(keys.SCANDOTS))[keys.TERRAIN_LATENT]
+    return latent
+
+
+def asked(seen: TensorDictBase, latent: Tensor) -> TensorDictBase:
     """Images with what they should tell: ``terrain_latent`` [*B, 32], ``obstacle`` int64 [*B], ``place`` [*B, 8]."""
-    latent = teacher.scandots_encoder(seen.select(keys.SCANDOTS))[keys.TERRAIN_LATENT]
     kept = {
         keys.DEPTH: seen[keys.DEPTH],
         keys.TERRAIN_LATENT: latent,
@@ -169,8 +175,10 @@ def collect_images(env: AgilityEnv, teacher: Teacher, cfg: GlanceConfig, bits: i
         bits=16 if bits == 16 else 8,
         keep=(keys.DEPTH, keys.SCANDOTS, keys.OBSTACLE, keys.PLACE),
     )
-    # A view would keep the whole window.
-    rows = [asked(walker.collect()[0].clone(), teacher) for _ in range(-(-cfg.images // env.num_robots))]
+    rows = []
+    for _ in range(-(-cfg.images // env.num_robots)):
+        seen = walker.collect()[0].clone()  # a view would keep the whole window
+        rows.append(asked(seen, known_terrain(teacher, seen)))
     return torch.stack(rows)  # type: ignore[return-value, arg-type]
 
 
@@ -189,7 +197,7 @@ def pretrain(
     glances.images.extend(train[permutation(len(train), glances.generator)])
     metrics: dict[str, float] = {"pretrain/images": float(len(train))}
     for epoch in range(cfg.epochs):
-        glances.learn(max(1, len(train) // cfg.batch), represent)
+        glances.learn(max(1, len(train) // cfg.batch), 0, represent)
         with torch.no_grad():
             pieces = [(len(part), *glances.errors(part, part[keys.DEPTH])) for part in test.split(cfg.batch)]
         for index, name in enumerate(ERRORS, start=1):

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from agility_rl.record import MCAPLogger
@@ -88,6 +88,20 @@ class Laps:
         """A part ends here, and the next begins."""
         now = time.perf_counter()
         self.metrics[f"time/{name}"], self._last = now - self._last, now
+
+
+def finite(total: Tensor, what: str, iteration: int) -> Tensor:
+    """A loss, if it is a number.
+
+    Raises:
+        ValueError: if it is none; the weights are then still those of the step before.
+    """
+    if not bool(total.isfinite()):
+        raise ValueError(
+            f"the loss of {what} is {total.item()} in iteration {iteration + 1}; nothing was saved since the last "
+            "checkpoint: look for NaN in teacher and images, or --resume from there with a lower learning rate"
+        )
+    return total
 
 
 class SavedRun:

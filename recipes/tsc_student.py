@@ -22,16 +22,15 @@ from pathlib import Path
 
 import torch
 from course_metrics import judge, set_course
-from glances import pretrain
+from glances import asked, known_terrain, pretrain
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import Laps, own_options, run
+from training_run import Laps, finite, own_options, run
 from tsc_student_config import PRESETS, Config
 from tsc_student_setup import (
     Components,
     annealed,
     build,
-    finite,
     load_student,
     resolve,
     save_policy,
@@ -111,9 +110,8 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         lap("pretrain")
     parts.collector.led = round(parts.env.num_robots * annealed(own.led, 0.0, iteration, own.led_until))
     window = parts.collector.collect()
-    if own.latent is not None:
-        known = parts.teacher.scandots_encoder(window.select(keys.SCANDOTS))[keys.TERRAIN_LATENT]
-        window[keys.LABEL, keys.TERRAIN_LATENT] = known
+    if keys.SCANDOTS in window.keys():  # noqa: SIM118
+        window[keys.LABEL, keys.TERRAIN_LATENT] = known_terrain(parts.teacher, window)
     lap("collect")
     metrics |= judge(parts.env, parts.curriculum, window)
     metrics |= imitate(parts, cfg, window, iteration)
@@ -121,8 +119,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     if parts.glances is not None and cfg.glance.steps:
         rates = (cfg.glance.learning_rate, cfg.glance.final_learning_rate)
         set_learning_rate(parts.glances.optimizer, annealed(*rates, iteration, own.decay))
-        parts.glances.keep(window[:: cfg.glance.every], parts.teacher)
-        metrics |= parts.glances.learn(cfg.glance.steps)
+        seen = window[:: cfg.glance.every]
+        parts.glances.images.extend(asked(seen, seen[keys.LABEL, keys.TERRAIN_LATENT]).flatten())
+        metrics |= parts.glances.learn(cfg.glance.steps, iteration)
         lap("glances")
     if byol is not None:
         metrics |= represent_window(parts, cfg, window, iteration)

@@ -13,7 +13,7 @@ from glances import Glances
 from hardware import simulator_options, training_device
 from rollouts import Controller
 from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor, nn
+from torch import nn
 from torchrl.objectives import SoftUpdate
 from tsc_artifacts import Trained, load_bbc_of, load_trained, trained_bbc
 from tsc_curriculum import Curriculum
@@ -246,20 +246,6 @@ def set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
     """Of all parameters."""
     for group in optimizer.param_groups:
         group["lr"] = value
-
-
-def finite(total: Tensor, what: str, iteration: int) -> Tensor:
-    """A loss, if it is a number.
-
-    Raises:
-        ValueError: if it is none; the weights are then still those of the step before.
-    """
-    if not bool(total.isfinite()):
-        raise ValueError(
-            f"the loss of {what} is {total.item()} in iteration {iteration + 1}; nothing was saved since the last "
-            "checkpoint: look for NaN in teacher and images, or --resume from there with a lower learning rate"
-        )
-    return total
 
 
 def save_policy(parts: Components, cfg: Config, folder: Path) -> None:

@@ -115,14 +115,15 @@ def test_glances_move_the_encoder_and_the_imitation_the_rest(recipe: ModuleType,
     window = parts.collector.collect()
     feature = parts.student.depth_encoder(window[0].select("depth"))["depth_feature"]
     torch.testing.assert_close(window["depth_feature"][0], feature)
-    window["label", "terrain_latent"] = parts.teacher.scandots_encoder(window.select("scandots"))["terrain_latent"]
+    glances = module("glances")
+    window["label", "terrain_latent"] = glances.known_terrain(parts.teacher, window)
     recipe.imitate(parts, cfg, window, 0)
     changed = moved()
     assert "memory.cell" in changed and "memory.head" in changed and "memory.glance" not in changed
     assert not any(name.startswith("depth_encoder") for name in changed)
-    parts.glances.keep(window[::2], parts.teacher)
+    parts.glances.images.extend(glances.asked(window[::2], window["label", "terrain_latent"][::2]).flatten())
     assert len(parts.glances.images.rows) == 2 * 4
-    parts.glances.learn(1)
+    parts.glances.learn(1, 0)
     assert moved() == {"depth_encoder.module", "memory.glance"}
     parts.env.close()
 
@@ -135,8 +136,11 @@ def test_only_the_newest_images_are_kept(module: Module) -> None:
     assert images.rows["depth"].tolist() == [1, 2, 3, 4, 5]
     other = module("glances").Newest(5)
     other.load_state_dict(images.state_dict())
+    images.extend(TensorDict({"depth": torch.arange(6, 20)}, [14]))
+    assert images.rows["depth"].tolist() == [15, 16, 17, 18, 19]
+    other.load_state_dict(images.state_dict())
     one, two = (x.draw(20, torch.Generator().manual_seed(1))["depth"] for x in (images, other))
-    assert torch.equal(one, two) and set(one.tolist()) <= {1, 2, 3, 4, 5}
+    assert torch.equal(one, two) and set(one.tolist()) <= {15, 16, 17, 18, 19}
 
 
 def test_glances_of_the_same_images_lower_their_errors(recipe: ModuleType, module: Module, smoke: Any) -> None:
@@ -144,8 +148,9 @@ def test_glances_of_the_same_images_lower_their_errors(recipe: ModuleType, modul
     nothing = replace(smoke.augmentation, rectangle=0.0, white_noise=0.0, dropout=0.0, blur=0.0)
     cfg = replace(smoke, augmentation=nothing, precision="float32", glance=replace(smoke.glance, steps=1))
     parts = setup.build(*setup.resolve(cfg))
-    parts.glances.keep(parts.collector.collect(), parts.teacher)
-    first, last = (parts.glances.learn(20) for _ in range(2))
+    window, glances = parts.collector.collect(), module("glances")
+    parts.glances.images.extend(glances.asked(window, glances.known_terrain(parts.teacher, window)).flatten())
+    first, last = (parts.glances.learn(20, 0) for _ in range(2))
     for name in ("error_latent", "loss_obstacle", "error_place"):
         assert last[f"glance/{name}"] < 0.8 * first[f"glance/{name}"], name
     parts.env.close()
