@@ -13,6 +13,7 @@ from course_judgement import layout_of
 from course_rollouts import Episode
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from play_course import add_course
 
 from agility_rl import rotations
 from agility_rl.behaviours import BEHAVIOURS
@@ -21,14 +22,11 @@ from agility_rl.envs.layout import CourseLayout
 from agility_rl.go2.appearance import dress
 from agility_rl.go2.constants import CONTROL_DT
 from agility_rl.go2.model import build_spec
-from agility_rl.simulation.scenery import add_scenery
 
 PLACES = (-0.7, 0.0, 0.7)
 """Where on the axis of each obstacle the robot is shown, from the edge before it over its middle to that behind [m]."""
 WIDTH, HEIGHT = 360, 270
 """Of a picture [pixels]."""
-SEE_THROUGH = 0.15
-"""Opacity of the walls."""
 
 
 def moments(layout: CourseLayout, episode: Episode) -> list[tuple[str, list[int]]]:
@@ -47,14 +45,8 @@ def moments(layout: CourseLayout, episode: Episode) -> list[tuple[str, list[int]
 def world(layout: CourseLayout) -> mujoco.MjModel:
     """The Go2 and the course as they should be looked at."""
     spec = build_spec()
-    add_scenery(spec, layout.pieces)
-    position, quaternion, _ = (rows[0].tolist() for rows in layout.poses())
-    for piece, at, turn in zip(layout.pieces, position, quaternion, strict=True):
-        body = spec.body(piece.name)
-        body.pos, body.quat = at, turn
-        if piece.name.startswith("wall"):
-            for geom in body.geoms:
-                geom.rgba = (*geom.rgba[:3], SEE_THROUGH)
+    position, quaternion, _ = (rows[0] for rows in layout.poses())
+    add_course(spec, layout.pieces, position, quaternion)
     return dress(spec).compile()
 
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mujoco
 import torch
+from torch import Tensor
 
 from agility_rl import rotations
 from agility_rl.envs.arena import START_BEHIND
 from agility_rl.envs.course_presets import COURSES
 from agility_rl.envs.layout import CourseLayout
 from agility_rl.go2.model import build_spec
-from agility_rl.simulation.scenery import add_scenery
+from agility_rl.simulation.scenery import Piece, add_scenery
 
 FLOOR = ("type", "size", "contype", "conaffinity", "condim", "priority", "friction", "solref")
 """What a course takes over from the floor on which it stands."""
@@ -41,16 +42,18 @@ def surround(name: str, seed: int) -> Callable[[mujoco.MjSpec], None]:
     position = rotations.rotate(turn.expand(len(position), 4), position - start)
     quaternion = rotations.multiply(turn.expand(len(quaternion), 4), quaternion)
 
-    def add(spec: mujoco.MjSpec) -> None:
-        add_scenery(spec, layout.pieces)
-        for piece, at, to in zip(layout.pieces, position.tolist(), quaternion.tolist(), strict=True):
-            body = spec.body(piece.name)
-            body.pos, body.quat = at, to
-            if piece.name.startswith("wall"):
-                for geom in body.geoms:
-                    geom.rgba = (*geom.rgba[:3], SEE_THROUGH)
+    return lambda spec: add_course(spec, layout.pieces, position, quaternion)
 
-    return add
+
+def add_course(spec: mujoco.MjSpec, pieces: Sequence[Piece], position: Tensor, quaternion: Tensor) -> None:
+    """Add pieces to a robot's model where they stand, ``[P, 3]`` [m] and ``[P, 4]``, with walls to see through."""
+    add_scenery(spec, pieces)
+    for piece, at, turn in zip(pieces, position.tolist(), quaternion.tolist(), strict=True):
+        body = spec.body(piece.name)
+        body.pos, body.quat = at, turn
+        if piece.name.startswith("wall"):
+            for geom in body.geoms:
+                geom.rgba = (*geom.rgba[:3], SEE_THROUGH)
 
 
 def write_world(name: str, seed: int, file: Path) -> None:
