@@ -165,7 +165,7 @@ class Config(HardwareConfig):
     """Folder under ``runs``."""
     runs: Path = Path("runs")
     seed: int = 0
-    bbc: Path = Path("pretrained/bbc_course")
+    bbc: Path = Path("pretrained/bbc_leaping")
     """Run or artifact folder of the Basic Behaviour Controller."""
     iterations: int = 30_000
     """Released code (method notes, section 5.9)."""
@@ -195,31 +195,46 @@ PAPER = Config(
 )
 CPU = Config(
     iterations=3000,
-    max_minutes=180.0,
-    env=EnvConfig(num_robots=256, decision_steps=5, randomize=False, push_interval=None),
+    max_minutes=60.0,
+    place=True,
+    env=EnvConfig(
+        num_robots=256,
+        decision_steps=2,
+        randomize=False,
+        push_interval=None,
+        command_noise=(0.97, 1.03),
+        start_spread=1.5,
+        start_after=0.5,
+        goal_radius=0.45,
+    ),
     ppo=PPOConfig(
-        steps=24,
+        steps=40,
         minibatches=4,
+        learning_rate=1e-4,
+        critic_learning_rate=3e-4,
         max_learning_rate=2e-3,
-        desired_kl=0.02,
-        gamma=0.97,
-        entropy=0.005,
+        gamma=0.99,
+        entropy=0.001,
         continuous="selected",
-        hidden=(256, 128, 64),
         precision="auto",
-        initial_std=0.3,
-        critic_warm_up=8,
+        averaging=0.98,
+        initial_std=0.2,
+        min_std=0.15,
+        noise_seconds=0.12,
+        hidden=(256, 128, 64),
+        critic_warm_up=30,
     ),
     reward=RewardConfig(task=1.0, goal_velocity=2.0, least_speed=1.2, heading=0.5, reach_goal=30.0, finished=12.0),
-    cloning=CloningConfig(iterations=20, script="trot:1.2"),
+    cloning=CloningConfig(iterations=40, script="leap", smoothing=0.02),
     adaptation=AdaptationConfig(learning_rate=1e-3, minibatches=4),
+    curriculum=CurriculumConfig(difficulty=1.0, obstacles=6, practice=2.0),
 )
 SMOKE = replace(
     CPU,
     name="smoke_teacher",
     iterations=2,
     checkpoint_every=1,
-    env=replace(CPU.env, num_robots=8, decision_steps=2),
+    env=replace(CPU.env, num_robots=8),
     ppo=replace(CPU.ppo, steps=4, epochs=1, minibatches=2, hidden=(32, 32), critic_warm_up=1),
     adaptation=replace(CPU.adaptation, every=2, minibatches=2),
     cloning=replace(CPU.cloning, iterations=1, epochs=1, minibatches=2),

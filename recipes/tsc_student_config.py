@@ -135,7 +135,7 @@ class Config(HardwareConfig):
     """Folder under ``runs``."""
     runs: Path = Path("runs")
     seed: int = 0
-    teacher: Path = Path("pretrained/teacher")
+    teacher: Path = Path("pretrained/teacher_leaping")
     """Run or artifact folder of the teacher; the student decides as often, on the same behaviours."""
     bbc: Path | None = None
     """Run or artifact folder of the Basic Behaviour Controller that the teacher was trained on; found by default."""
@@ -174,13 +174,28 @@ class Config(HardwareConfig):
 
 PAPER = Config()
 CPU = Config(
-    iterations=1200,
-    max_minutes=240.0,
+    iterations=450,
+    max_minutes=90.0,
     checkpoint_every=25,
+    byol=False,
     precision="auto",
-    env=EnvConfig(num_robots=64, randomize=False, push_interval=None),
-    imitation=ImitationConfig(minibatches=4, decay=1200, led=0.8),
+    memory=256,
+    encoder_hidden=24,
+    heading_gate=4.0,
+    env=EnvConfig(num_robots=64, randomize=False, push_interval=None, command_noise=(0.97, 1.03), start_spread=2.0),
+    imitation=ImitationConfig(
+        steps=48,
+        epochs=4,
+        minibatches=4,
+        decay=450,
+        place=0.5,
+        latent=2.0,
+        compared="selected",
+        led=0.8,
+        led_until=160,
+    ),
     representation=RepresentationConfig(images=384, minibatches=1),
+    glance=GlanceConfig(steps=32, images=16_000, every=2, epochs=8, kept=60_000),
     curriculum=CurriculumConfig(difficulty=1.0, obstacles=6, practice=1.0),
 )
 SMOKE = replace(
@@ -188,10 +203,11 @@ SMOKE = replace(
     name="smoke_student",
     iterations=2,
     checkpoint_every=1,
+    byol=True,
     memory=16,
     encoder_hidden=8,
     env=replace(CPU.env, num_robots=4),
-    imitation=replace(CPU.imitation, steps=4, minibatches=2),
+    imitation=replace(CPU.imitation, steps=4, epochs=1, minibatches=2),
     representation=replace(CPU.representation, images=8, hidden=16),
     glance=GlanceConfig(images=8, every=1, epochs=1, batch=4, held_out=0.25, kept=16),
 )

@@ -224,13 +224,13 @@ def load_student(parts: Components, path: Path) -> None:
     trained = load_trained(path, "student")
     # A student is told what to do and draws nothing: what its teacher's deviations were makes no difference. How often
     # it decides is this run's: it only counts its way by it.
-    own, wanted = (
-        {name: value for name, value in network.settings.items() if name not in ("initial_std", "min_std", "period")}
-        for network in (trained.network, parts.student)
-    )
-    if own != wanted:
+    ignored = ("initial_std", "min_std", "period")
+    own, wanted = trained.network.settings, parts.student.settings
+    differ = [name for name in wanted if name not in ignored and own.get(name) != wanted[name]]
+    if differ:
+        has, builds = ({name: sizes.get(name) for name in differ} for sizes in (own, wanted))
         raise ArtifactError(
-            f"{trained.artifact.folder}: the student has {own}, this run builds {wanted}; give the same --memory, "
+            f"{trained.artifact.folder}: the student has {has}, this run builds {builds}; give the same --memory, "
             "--encoder-hidden and --heading-gate, and a teacher of the same sizes"
         )
     own_estimator = {f"estimator.{name}": value for name, value in parts.student.estimator.state_dict().items()}

@@ -51,7 +51,8 @@ def make_student(untrained_teacher: Path, tmp_path: Path, module: Callable[[str]
         torch.manual_seed(seed)
         teacher = Artifact.load(untrained_teacher / "policy")
         points = [[list(point) for point in kind.way_points] for kind in OBSTACLES.values()]
-        network = RecurrentStudent(**teacher.manifest["network"], memory=16, encoder_hidden=8, way_points=points)
+        sizes = {"memory": 16, "encoder_hidden": 8, "heading_gate": 4.0}
+        network = RecurrentStudent(**teacher.manifest["network"], **sizes, way_points=points)
         camera = describe_camera()
         camera["training"] = {"frame_steps": 1, "latency": [1, 1], "pitch": 0.09, "offset_noise": 0.05}
         manifest = build_manifest("student", features.CONTROLLER_LAYOUTS, control_period=0.04)

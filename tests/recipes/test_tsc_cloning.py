@@ -122,11 +122,11 @@ def test_own_needs_a_teacher(module: Module, smoke: Any) -> None:
     with pytest.raises(ValueError, match="leaves decisions to a teacher, and there is none"):
         module("deciders").load_script("own,tunnel=walk:0.4", smoke.bbc)
     first = recipe.train(replace(smoke, iterations=1))
-    calm = replace(smoke.ppo, initial_std=0.12)
+    calm = replace(smoke.ppo, initial_std=0.12, min_std=0.1)
     second = recipe.train(replace(cfg, name="second", iterations=1, init_from=first, ppo=calm))
     states = [Artifact.load(run / "policy").state for run in (first, second)]
     name = next(name for name in states[0] if name.endswith("parameters_head.std"))
-    assert states[0][name].mean() > 0.25 and states[1][name].max() < 0.15, "it begins with less to try"
+    assert states[0][name].mean() > 0.17 and states[1][name].max() < 0.15, "it begins with less to try"
 
 
 def test_a_bad_script_is_refused_before_anything_is_trained(module: Module, smoke: Any) -> None:
@@ -138,7 +138,7 @@ def test_a_bad_script_is_refused_before_anything_is_trained(module: Module, smok
 
 def test_a_script_may_only_choose_what_the_teacher_may(module: Module, smoke: Any) -> None:
     recipe, only = module("tsc_teacher"), replace(smoke, behaviours=("canter",))
-    with pytest.raises(ValueError, match=r"--cloning.script trot:1.2 chooses trot, which --behaviours leaves out"):
+    with pytest.raises(ValueError, match=r"--cloning.script leap chooses .*trot.*, which --behaviours leaves out"):
         recipe.train(only)
     run = recipe.train(replace(only, iterations=1, cloning=replace(smoke.cloning, script="canter:1.2")))
     assert Artifact.load(run / "policy").manifest["network"]["allowed"] == [skill_index("canter")]

@@ -50,7 +50,7 @@ def test_a_run_writes_a_student_and_what_it_saw(
     student = RecurrentStudent(**manifest["network"])
     student.load_state_dict(artifact.state)
     scalars = read_scalars(run)
-    losses = ("behaviour", "parameters", "heading", "obstacle", "place", "byol")
+    losses = ("behaviour", "parameters", "heading", "obstacle", "place", "latent", "byol")
     for name in (*(f"loss_{loss}" for loss in losses), "spread"):
         assert bool(scalars[name][1].isfinite().all()) and bool((scalars[name][1] > 0.0).all()), name
     for name in ("accuracy_behaviour", "accuracy_obstacle", "success/bar_jump", "use/trot", "time/collect"):
@@ -76,7 +76,7 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smok
 def test_what_a_step_moves(recipe: ModuleType, module: Module, smoke: Any) -> None:
     """Imitation moves student and encoder, not the estimator; BYOL the encoder alone; the teacher nothing at all."""
     setup = module("tsc_student_setup")
-    cfg = replace(smoke, imitation=replace(smoke.imitation, minibatches=1))
+    cfg = replace(smoke, imitation=replace(smoke.imitation, minibatches=1, latent=None))
     parts = setup.build(*setup.resolve(cfg))
     state = {name: value.clone() for name, value in parts.student.state_dict().items()}
     teacher = {name: value.clone() for name, value in parts.teacher.state_dict().items()}
@@ -101,7 +101,7 @@ def test_what_a_step_moves(recipe: ModuleType, module: Module, smoke: Any) -> No
 
 def test_glances_move_the_encoder_and_the_imitation_the_rest(recipe: ModuleType, module: Module, smoke: Any) -> None:
     setup = module("tsc_student_setup")
-    own, glance = replace(smoke.imitation, minibatches=1, latent=1.0), replace(smoke.glance, steps=1, every=2)
+    own, glance = replace(smoke.imitation, minibatches=1), replace(smoke.glance, steps=1, every=2)
     cfg = replace(smoke, imitation=own, glance=glance)
     parts = setup.build(*setup.resolve(cfg))
     state = {name: value.clone() for name, value in parts.student.state_dict().items()}
@@ -158,7 +158,7 @@ def test_glances_of_the_same_images_lower_their_errors(recipe: ModuleType, modul
 
 def test_imitation_of_one_window_lowers_its_loss(recipe: ModuleType, module: Module, smoke: Any) -> None:
     setup = module("tsc_student_setup")
-    own = replace(smoke.imitation, minibatches=1, augment=False, learning_rate=3e-3)
+    own = replace(smoke.imitation, minibatches=1, latent=None, augment=False, learning_rate=3e-3)
     cfg = replace(smoke, byol=False, memory=64, precision="float32", imitation=own)
     parts = setup.build(*setup.resolve(cfg))
     window = parts.collector.collect()
@@ -269,7 +269,7 @@ def test_another_camera_another_teacher_and_other_sizes_are_refused(
     with pytest.raises(ValueError, match=r"images of image \[60, 106\], this code's camera has \[58, 87\]"):
         recipe.train(replace(smoke, init_from=wrong))
     assert not (smoke.runs / smoke.name).exists(), "the name stays free"
-    with pytest.raises(ValueError, match=r"'memory': 16.*give the same --memory"):
+    with pytest.raises(ValueError, match=r"has {'memory': 16}, this run builds {'memory': 17}; give the same --memory"):
         recipe.train(replace(smoke, name="larger", memory=17, init_from=make_student()))
     bold = Artifact.load(make_student("bold"))
     network = bold.manifest["network"] | {"initial_std": 0.9, "min_std": 0.2}
@@ -286,11 +286,11 @@ def test_another_camera_another_teacher_and_other_sizes_are_refused(
 
 def test_nan_stops_before_a_step_and_says_where(recipe: ModuleType, module: Module, smoke: Any) -> None:
     setup = module("tsc_student_setup")
-    parts = setup.build(*setup.resolve(smoke))
+    cfg = replace(smoke, imitation=replace(smoke.imitation, minibatches=1, latent=None))
+    parts = setup.build(*setup.resolve(cfg))
     window = parts.collector.collect()
     before = {name: value.clone() for name, value in parts.student.state_dict().items()}
     window["label", "parameters"][0, 0] = math.nan
-    cfg = replace(smoke, imitation=replace(smoke.imitation, minibatches=1))
     with pytest.raises(ValueError, match="the loss of the imitation is nan in iteration 8; nothing was saved since"):
         recipe.imitate(parts, cfg, window, 7)
     assert all(torch.equal(value, before[name]) for name, value in parts.student.state_dict().items())
