@@ -156,6 +156,9 @@ class Config(HardwareConfig):
     """Of the depth encoder's layers; ``auto`` is bfloat16 on hardware that multiplies in it."""
     memory: int = 512
     """Units of the GRU (supplement S6)."""
+    encoder_channels: tuple[int, int] = (32, 64)
+    """Of the depth encoder's convolutions (method notes, section 5.9). Half of a student's weights and of its time hang
+    on the second number."""
     encoder_hidden: int = 128
     """Units of the depth encoder's hidden linear layer (method notes, section 5.9)."""
     heading_gate: float = HEADING_GATE
@@ -180,7 +183,8 @@ CPU = Config(
     byol=False,
     precision="auto",
     memory=256,
-    encoder_hidden=24,
+    encoder_channels=(32, 24),
+    encoder_hidden=64,
     heading_gate=4.0,
     env=EnvConfig(num_robots=64, randomize=False, push_interval=None, command_noise=(0.97, 1.03), start_spread=2.0),
     imitation=ImitationConfig(
@@ -205,6 +209,7 @@ SMOKE = replace(
     checkpoint_every=1,
     byol=True,
     memory=16,
+    encoder_channels=(4, 8),
     encoder_hidden=8,
     env=replace(CPU.env, num_robots=4),
     imitation=replace(CPU.imitation, steps=4, epochs=1, minibatches=2),

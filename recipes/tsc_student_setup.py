@@ -127,6 +127,7 @@ def build(cfg: Config, trained: Trained) -> Components:
     student = RecurrentStudent.from_teacher(
         teacher,
         memory=cfg.memory,
+        encoder_channels=cfg.encoder_channels,
         encoder_hidden=cfg.encoder_hidden,
         heading_gate=cfg.heading_gate,
         period=env.dt * env.decision_steps,
@@ -231,7 +232,7 @@ def load_student(parts: Components, path: Path) -> None:
         has, builds = ({name: sizes.get(name) for name in differ} for sizes in (own, wanted))
         raise ArtifactError(
             f"{trained.artifact.folder}: the student has {has}, this run builds {builds}; give the same --memory, "
-            "--encoder-hidden and --heading-gate, and a teacher of the same sizes"
+            "--encoder-channels, --encoder-hidden and --heading-gate, and a teacher of the same sizes"
         )
     own_estimator = {f"estimator.{name}": value for name, value in parts.student.estimator.state_dict().items()}
     parts.student.load_state_dict(trained.network.state_dict() | own_estimator)

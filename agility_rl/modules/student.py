@@ -67,7 +67,8 @@ class RecurrentStudent(nn.Module):
         allowed: indices of the behaviours that it may choose; ``None`` for all.
         num_place: size of ``place``, as its teacher's: 0 or 8.
         memory: units of the GRU.
-        encoder_hidden: units of the depth encoder's hidden linear layer.
+        encoder_channels: of the depth encoder's two convolutions.
+        encoder_hidden: units of its hidden linear layer.
         heading_gate: see :data:`HEADING_GATE`.
         period: of a decision [s]; who infers the place counts what it has gone meanwhile.
         way_points: ``[K][W][2]``, of every type of obstacle in its frame [m]; who infers the place knows them.
@@ -95,6 +96,7 @@ class RecurrentStudent(nn.Module):
         num_place: int = 0,
         *,
         memory: int = 512,
+        encoder_channels: tuple[int, int] = (32, 64),
         encoder_hidden: int = 128,
         heading_gate: float = HEADING_GATE,
         period: float = constants.CONTROL_DT,
@@ -113,11 +115,12 @@ class RecurrentStudent(nn.Module):
             "allowed": None if allowed is None else list(allowed),
             "num_place": num_place,
             "memory": memory,
+            "encoder_channels": list(encoder_channels),
             "encoder_hidden": encoder_hidden,
             "heading_gate": heading_gate,
             **({"period": period, "way_points": way_points} if num_place else {}),
         }
-        self.depth_encoder = DepthEncoder(NUM_FEATURES, hidden=encoder_hidden)
+        self.depth_encoder = DepthEncoder(NUM_FEATURES, channels=encoder_channels, hidden=encoder_hidden)
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
         sizes = (NUM_FEATURES, features.NUM_PROPRIOCEPTION, memory, num_obstacles)

@@ -51,7 +51,7 @@ def make_student(untrained_teacher: Path, tmp_path: Path, module: Callable[[str]
         torch.manual_seed(seed)
         teacher = Artifact.load(untrained_teacher / "policy")
         points = [[list(point) for point in kind.way_points] for kind in OBSTACLES.values()]
-        sizes = {"memory": 16, "encoder_hidden": 8, "heading_gate": 4.0}
+        sizes = {"memory": 16, "encoder_channels": (4, 8), "encoder_hidden": 8, "heading_gate": 4.0}
         network = RecurrentStudent(**teacher.manifest["network"], **sizes, way_points=points)
         camera = describe_camera()
         camera["training"] = {"frame_steps": 1, "latency": [1, 1], "pitch": 0.09, "offset_noise": 0.05}
