@@ -4,7 +4,7 @@ The controller runs as it does on a robot, as fast as it can instead of at 50 Hz
 wall. The image is new in every step; a decision is due every step too (``--decision-steps`` makes it rarer). Memory is
 read before and after, to see whether a long run grows.
 
-    python benchmarks/control_step.py pretrained/bbc_course --task pretrained/student --steps 180000  # an hour
+    python benchmarks/control_step.py pretrained/bbc_leaping --task pretrained/student_leaping --steps 180000  # an hour
     python benchmarks/control_step.py pretrained/bbc_course             # a student with random weights of full size
 """
 

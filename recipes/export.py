@@ -10,7 +10,7 @@ Out: ``--output`` (the same artifact folder by default) with ``manifest.json``, 
      ``policy-*.onnx``; the ONNX file carries the manifest as metadata.
 
     python recipes/export.py runs/my_run [--output exported/my_bbc]
-    python recipes/export.py runs/my_student --bbc pretrained/bbc_course
+    python recipes/export.py runs/my_student --bbc pretrained/bbc_leaping
 
 Needs the extra ``export``: pip install 'agility_rl[export]'.
 """

@@ -57,6 +57,17 @@ def test_sizes_are_those_of_the_supplement() -> None:
     assert placed.head[0].out_features == 32 + 7 + 8 + 9 + 2 * 5
 
 
+def test_a_smaller_encoder_is_built_again_from_its_settings() -> None:
+    small = RecurrentStudent(memory=M, encoder_channels=(4, 3), encoder_hidden=5)
+    first, _, _, second, _ = small.depth_encoder.module.convolutions
+    assert (first.out_channels, second.out_channels) == (4, 3)
+    assert small.depth_encoder.module.linear[1].weight.shape == (5, 3 * 25 * 39)  # 58 x 87, kernel 5, pool 2, kernel 3
+    again = RecurrentStudent(**small.settings)
+    again.load_state_dict(small.state_dict())
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        RecurrentStudent(memory=M, encoder_hidden=5).load_state_dict(small.state_dict())
+
+
 def test_shapes_and_keys(student: RecurrentStudent) -> None:
     td = student.policy()(steps(1, 3)[0].exclude("heading_error"))
     shapes = {
