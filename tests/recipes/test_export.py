@@ -123,6 +123,14 @@ def test_a_student_is_exported_with_its_memory(
         onnx_student(Artifact.load(run))
 
 
+def test_the_shipped_student_is_exported(export: ModuleType, repository: Path, tmp_path: Path) -> None:
+    """Trained weights round more coarsely than random ones."""
+    output = tmp_path / "exported"
+    assert export.main(export.Config(repository / "pretrained" / "student_leaping", output=output, steps=60)) == output
+    entry = Artifact.load(output, kind="student").manifest["onnx"]
+    assert entry["checked_on"] == "240 recorded inputs" and 0.0 < entry["largest_difference"] <= export.SAME_DECISION
+
+
 def test_steps_must_be_positive(export: ModuleType, untrained: Path) -> None:
     with pytest.raises(ValueError, match="--steps of at least 1"):
         export.main(export.Config(untrained, steps=0))
