@@ -124,11 +124,15 @@ def test_a_student_is_exported_with_its_memory(
 
 
 def test_the_shipped_student_is_exported(export: ModuleType, repository: Path, tmp_path: Path) -> None:
-    """Trained weights round more coarsely than random ones."""
+    """Trained weights round more coarsely than random ones; what differs in a batch is refused all the same."""
     output = tmp_path / "exported"
     assert export.main(export.Config(repository / "pretrained" / "student_leaping", output=output, steps=60)) == output
     entry = Artifact.load(output, kind="student").manifest["onnx"]
     assert entry["checked_on"] == "240 recorded inputs" and 0.0 < entry["largest_difference"] <= export.SAME_DECISION
+    exportable = export.student_to_export(export.Config(repository / "pretrained" / "student_leaping", steps=4))
+    shifted = replace(exportable, expected=tuple(values + 2e-5 for values in exportable.expected))
+    with pytest.raises(ArtifactError, match=r"differs from the training policy by .*, expected at most 1e-05"):
+        export.check_network(shifted)
 
 
 def test_steps_must_be_positive(export: ModuleType, untrained: Path) -> None:
