@@ -157,8 +157,8 @@ class Config(HardwareConfig):
     memory: int = 512
     """Units of the GRU (supplement S6)."""
     encoder_channels: tuple[int, int] = (32, 64)
-    """Of the depth encoder's convolutions (method notes, section 5.9). Half of a student's weights and of its time hang
-    on the second number."""
+    """Of the depth encoder's convolutions (method notes, section 5.9). Most of a student's weights and of its encoder's
+    time are in proportion to the second number."""
     encoder_hidden: int = 128
     """Units of the depth encoder's hidden linear layer (method notes, section 5.9)."""
     heading_gate: float = HEADING_GATE
