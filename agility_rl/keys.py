@@ -83,6 +83,10 @@ x, y [m], sine and cosine of its yaw in the frame of the obstacle to pass."""
 OBSTACLE = "obstacle"
 """float32 ``[*B, 7]``, one-hot type of the obstacle to pass; order of :data:`agility_rl.envs.obstacles.OBSTACLES`."""
 
+PROGRESS = "progress"
+"""float32 ``[*B, S]``, one-hot: which way-point is the present one, of those of each obstacle of each route of the
+course, in their order; obstacles of fewer way-points than others leave entries unused."""
+
 OUTCOME = "outcome"
 """nested bool: ``[*B, 1]`` ``success``, ``finished``; ``[*B, 7]`` ``passed``, ``bypassed``, ``failed``, a type each."""
 
@@ -103,6 +107,9 @@ HEADING_ESTIMATE = "heading_estimate"
 
 PLACE_ESTIMATE = "place_estimate"
 """float32 ``[*B, 8]``, the student's guess of :data:`PLACE`, where its teacher reads that."""
+
+PROGRESS_LOGITS = "progress_logits"
+"""float32 ``[*B, S]``, the student's log-probabilities of :data:`PROGRESS`, where its teacher reads the place."""
 
 OBSTACLE_LOGITS = "obstacle_logits"
 """float32 ``[*B, 7]``, the student's unnormalised log-probabilities of :data:`OBSTACLE`."""

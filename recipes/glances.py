@@ -1,6 +1,7 @@
 """What single images tell: the depth encoder learns from what is asked of each image by itself.
 
-An image is asked for what the teacher's scandots are encoded to, for the obstacle ahead and for the robot's place.
+An image is asked for what the teacher's scandots are encoded to, for the obstacle ahead, for the robot's place at it
+and for its progress on the course.
 Consecutive images of a window are nearly the same, and the encoder takes most of an iteration's time: images drawn from
 all that was seen lately teach it as much in a fraction of that, and the imitation then trains memory and actor on
 features alone. Ours: the sources train the encoder from nothing, within the imitation.
@@ -22,19 +23,30 @@ from tsc_student_config import GlanceConfig
 from agility_rl import keys
 from agility_rl.collectors import DAggerCollector
 from agility_rl.envs import AgilityEnv
-from agility_rl.envs.arena import NUM_PLACE
+from agility_rl.envs.course import Course
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2.camera import dequantize
 from agility_rl.modules import DepthAugmentation, RecurrentStudent, Teacher
-from agility_rl.modules.mlp import mlp
+from agility_rl.modules.glance import EXPECTED, NUM_POSE, Glance
 from agility_rl.modules.placed_memory import PlacedMemory
+from agility_rl.modules.planar import inverted, moved
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 from agility_rl.training import distributed
 from agility_rl.training.seeding import permutation
 
-SIZES = (NUM_TERRAIN_LATENT, len(OBSTACLES), NUM_PLACE)
-ERRORS = ("error_latent", "loss_obstacle", "error_place", "accuracy_obstacle")
-"""What is measured: mean squared error of the latent, cross-entropy, mean absolute error of the place [m], share."""
+ERRORS = (
+    "error_latent",
+    "loss_obstacle",
+    "loss_place",
+    "error_place",
+    "loss_progress",
+    "accuracy_obstacle",
+    "accuracy_progress",
+)
+"""What is measured: mean squared error, cross-entropy, negative log-likelihood by its scale, mean absolute error [m],
+cross-entropy, two shares."""
+WEIGHTS = (1.0, 1.0, 4.0, 0.0, 1.0, 0.0, 0.0)
+"""Of each in what the encoder descends: each number of the place counts once."""
 Represent = Callable[[Tensor], dict[str, Tensor]]
 """One step of another loss of the encoder, on stored images."""
 
@@ -85,32 +97,42 @@ class Glances:
 
     Attributes:
         encoder: of the student.
-        head: linear, of features; part of a student that infers its place.
+        head: reads its features; part of a student that infers its place.
         optimizer: of both.
         images: those seen lately, in 8 or 16 bits, each with what it should have told.
         batch: so many of them are a step's.
         augmentation: disturbs them.
         generator: draws them.
+        points: way-points of an obstacle, in the count of the progress.
     """
 
     encoder: nn.Module
-    head: nn.Module
+    head: Glance
     optimizer: torch.optim.Optimizer
     images: Newest
     batch: int
     augmentation: DepthAugmentation
     generator: torch.Generator
+    points: int
 
     @classmethod
     def of(
-        cls, student: RecurrentStudent, cfg: GlanceConfig, augmentation: DepthAugmentation, generator: torch.Generator
+        cls,
+        student: RecurrentStudent,
+        course: Course,
+        cfg: GlanceConfig,
+        augmentation: DepthAugmentation,
+        generator: torch.Generator,
     ) -> Glances:
-        """Of a student."""
+        """Of a student on a course."""
         memory, encoder = student.memory, student.depth_encoder.module
         device = next(student.parameters()).device
-        head = memory.glance if isinstance(memory, PlacedMemory) else mlp(32, (), sum(SIZES)).to(device)
+        points, legs = course.most_way_points, sum(map(len, course.routes))
+        known = (NUM_TERRAIN_LATENT, len(OBSTACLES), points * legs)
+        features = student.settings["encoder_features"]
+        head = memory.glance if isinstance(memory, PlacedMemory) else Glance(features, known, legs).to(device)
         optimizer = torch.optim.Adam([*encoder.parameters(), *head.parameters()], lr=cfg.learning_rate)
-        return cls(encoder, head, optimizer, Newest(cfg.kept), cfg.batch, augmentation, generator)
+        return cls(encoder, head, optimizer, Newest(cfg.kept), cfg.batch, augmentation, generator, points)
 
     def learn(self, steps: int, iteration: int, represent: Represent | None = None) -> dict[str, float]:
         """So many gradient steps on images drawn from those remembered; returns the means of :data:`ERRORS`."""
@@ -119,7 +141,7 @@ class Glances:
             sample = self.images.draw(self.batch, self.generator)
             errors = self.errors(sample, self.augmentation.augment(dequantize(sample[keys.DEPTH])))
             self.optimizer.zero_grad(set_to_none=True)
-            total = errors[0] + errors[1] + NUM_PLACE * errors[2]  # each number of the place counts once
+            total = torch.stack([weight * error for weight, error in zip(WEIGHTS, errors, strict=True) if weight]).sum()
             finite(total, "the encoder", iteration).backward()
             distributed.average_gradients(distributed.optimized(self.optimizer))
             self.optimizer.step()
@@ -129,17 +151,28 @@ class Glances:
         means = torch.stack(found).mean(0).tolist()
         return {f"glance/{name}": value for name, value in zip(ERRORS, means, strict=True)}
 
-    def errors(self, sample: TensorDictBase, depth: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def errors(self, sample: TensorDictBase, depth: Tensor) -> tuple[Tensor, ...]:
         """:data:`ERRORS` on images ``[M, 58, 87]``."""
-        latent, logits, place = self.head(self.encoder(depth)).split(SIZES, -1)
-        kind = sample[keys.OBSTACLE]
+        feature = self.encoder(depth)
+        latent, logits, stages = self.head.what(feature).split(self.head.known, -1)
+        kind, stage, ahead = sample[keys.OBSTACLE], sample[keys.PROGRESS], inverted(sample[keys.PLACE][..., -NUM_POSE:])
         error = (latent.tanh() - sample[keys.TERRAIN_LATENT]).square().mean()
-        distance = (place - sample[keys.PLACE]).abs().mean()
+        noise = torch.randn(*stage.shape, len(EXPECTED), generator=self.generator, device=ahead.device)
+        expected = moved(ahead, noise * noise.new_tensor(EXPECTED))
+        said, scale = self.head.where(feature, expected, stage // self.points)
+        distance = (said - ahead).abs()
+        # Laplace's likelihood; sine and cosine share a scale. Weighted by its scale: what is hard to see would else
+        # hardly be learned (Seitzer et al. 2022, arXiv:2203.09168, beta = 1).
+        scale = torch.cat((scale, scale[..., 2:]), -1)
+        surprise = (scale.exp().detach() * (distance * (-scale).exp() + scale)).mean()
         return (
             error,
             nn.functional.cross_entropy(logits, kind),
-            distance,
+            surprise,
+            distance.mean(),
+            nn.functional.cross_entropy(stages, stage),
             (logits.argmax(-1) == kind).to(distance.dtype).mean(),
+            (stages.argmax(-1) == stage).to(distance.dtype).mean(),
         )
 
 
@@ -151,12 +184,14 @@ def known_terrain(teacher: Teacher, seen: TensorDictBase) -> Tensor:
 
 
 def asked(seen: TensorDictBase, latent: Tensor) -> TensorDictBase:
-    """Images with what they should tell: ``terrain_latent`` [*B, 32], ``obstacle`` int64 [*B], ``place`` [*B, 8]."""
+    """Images with what they should tell: ``terrain_latent`` [*B, 32], ``obstacle`` int64 [*B], ``place`` [*B, 8],
+    ``progress`` int64 [*B]."""
     kept = {
         keys.DEPTH: seen[keys.DEPTH],
         keys.TERRAIN_LATENT: latent,
         keys.OBSTACLE: seen[keys.OBSTACLE].argmax(-1),
         keys.PLACE: seen[keys.PLACE],
+        keys.PROGRESS: seen[keys.PROGRESS].argmax(-1),
     }
     return TensorDict(kept, seen.batch_size)
 
@@ -173,7 +208,7 @@ def collect_images(env: AgilityEnv, teacher: Teacher, cfg: GlanceConfig, bits: i
         cfg.every,
         initial_hidden=torch.zeros(env.num_robots, 1, device=env.device),
         bits=16 if bits == 16 else 8,
-        keep=(keys.DEPTH, keys.SCANDOTS, keys.OBSTACLE, keys.PLACE),
+        keep=(keys.DEPTH, keys.SCANDOTS, keys.OBSTACLE, keys.PLACE, keys.PROGRESS),
     )
     rows = []
     for _ in range(-(-cfg.images // env.num_robots)):
@@ -199,9 +234,10 @@ def pretrain(
     for epoch in range(cfg.epochs):
         glances.learn(max(1, len(train) // cfg.batch), 0, represent)
         with torch.no_grad():
-            pieces = [(len(part), *glances.errors(part, part[keys.DEPTH])) for part in test.split(cfg.batch)]
-        for index, name in enumerate(ERRORS, start=1):
-            metrics[f"pretrain/{name}"] = sum(piece[0] * float(piece[index]) for piece in pieces) / len(test)
+            parts = test.split(cfg.batch)
+            found = torch.stack([len(part) * torch.stack(glances.errors(part, part[keys.DEPTH])) for part in parts])
+        for name, value in zip(ERRORS, (found.sum(0) / len(test)).tolist(), strict=True):
+            metrics[f"pretrain/{name}"] = value
         shown = "  ".join(f"{name} {metrics[f'pretrain/{name}']:.3g}" for name in ERRORS)
         print(f"pre-training {epoch + 1}/{cfg.epochs} on {len(train)} images; {len(test)} held out: {shown}")
     return metrics

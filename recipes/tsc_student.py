@@ -31,6 +31,7 @@ from tsc_student_setup import (
     Components,
     annealed,
     build,
+    frozen_parts,
     load_student,
     resolve,
     save_policy,
@@ -45,7 +46,7 @@ from agility_rl.training.seeding import permutation
 
 HEADLINE: tuple[str, ...] = ("time/minutes", "success", "episodes", "falls_per_minute")
 HEADLINE += ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_place", "loss_latent")
-HEADLINE += ("loss_byol", "spread")
+HEADLINE += ("loss_progress", "accuracy_progress", "loss_byol", "spread")
 HEADLINE += ("accuracy_behaviour", "accuracy_obstacle", "error_heading", "error_place")
 HEADLINE += tuple(f"success/{name}" for name in OBSTACLES)
 
@@ -155,7 +156,7 @@ def check(cfg: Config) -> None:
 def begin(parts: Components, cfg: Config) -> None:
     """Start from another run's student, if one is given."""
     if cfg.init_from is not None:
-        load_student(parts, cfg.init_from)
+        load_student(parts, cfg.init_from, frozen_parts(cfg))
 
 
 def train(cfg: Config) -> Path:

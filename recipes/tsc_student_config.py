@@ -74,6 +74,8 @@ class ImitationConfig:
     """Coefficients of the four terms of Eq. (15): all 1 (method notes, section 5.9)."""
     place: float = 0.25
     """Coefficient of the place, for students of a teacher that reads it (ours)."""
+    progress: float = 0.5
+    """Coefficient of the progress on the course, for the same students (ours)."""
     latent: float | None = None
     """Coefficient of the distance to the teacher's terrain latent (ours); without, only what the actor makes of it
     counts (method notes, section 5.9)."""
@@ -81,6 +83,9 @@ class ImitationConfig:
     """Of the errors to the current and the next way-point (method notes, section 5.9)."""
     compared: Literal["all", "selected"] = "all"
     """Whose parameters are compared: of all behaviours (method notes, section 5.9), or of the teacher's choice."""
+    actor: bool = True
+    """Whether actor and history encoder learn on (method notes, section 5.9). Without, they stay the teacher's, and
+    gradients pass through them to what is perceived."""
     led: float = 0.0
     """Share of the robots that do what the teacher says, at first; it falls to 0 (ours; Ross et al. 2011)."""
     led_until: int = 150
@@ -161,6 +166,9 @@ class Config(HardwareConfig):
     time are in proportion to the second number."""
     encoder_hidden: int = 128
     """Units of the depth encoder's hidden linear layer (method notes, section 5.9)."""
+    encoder_features: int = 32
+    """Numbers that it makes of an image (supplement S6). They have to tell terrain latent, obstacle, place and
+    progress."""
     heading_gate: float = HEADING_GATE
     """Heading errors beyond this are given, not predicted, in training [rad]: 0.6 (method notes, section 5.9)."""
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -185,6 +193,7 @@ CPU = Config(
     memory=256,
     encoder_channels=(32, 24),
     encoder_hidden=64,
+    encoder_features=64,
     heading_gate=4.0,
     env=EnvConfig(num_robots=64, randomize=False, push_interval=None, command_noise=(0.97, 1.03), start_spread=2.0),
     imitation=ImitationConfig(
@@ -199,7 +208,7 @@ CPU = Config(
         led_until=160,
     ),
     representation=RepresentationConfig(images=384, minibatches=1),
-    glance=GlanceConfig(steps=32, images=16_000, every=2, epochs=8, kept=60_000),
+    glance=GlanceConfig(steps=32, images=60_000, every=2, epochs=12, kept=60_000),
     curriculum=CurriculumConfig(difficulty=1.0, obstacles=6, practice=1.0),
 )
 SMOKE = replace(
@@ -211,6 +220,7 @@ SMOKE = replace(
     memory=16,
     encoder_channels=(4, 8),
     encoder_hidden=8,
+    encoder_features=8,
     env=replace(CPU.env, num_robots=4),
     imitation=replace(CPU.imitation, steps=4, epochs=1, minibatches=2),
     representation=replace(CPU.representation, images=8, hidden=16),

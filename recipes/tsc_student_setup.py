@@ -129,11 +129,14 @@ def build(cfg: Config, trained: Trained) -> Components:
         memory=cfg.memory,
         encoder_channels=cfg.encoder_channels,
         encoder_hidden=cfg.encoder_hidden,
+        encoder_features=cfg.encoder_features,
         heading_gate=cfg.heading_gate,
         period=env.dt * env.decision_steps,
         way_points=[[list(point) for point in kind.way_points] for kind in OBSTACLES.values()],
+        routes=[[list(leg) for leg in route] for route in env.arena.layout.course.legs],
     ).to(device)
-    student.estimator.requires_grad_(False)  # it estimates what can be measured: imitation shall not bend it
+    for name in frozen_parts(cfg):
+        getattr(student, name).requires_grad_(False)
     # A tenth to a third less time for the convolutions on a CPU.
     student.depth_encoder.to(memory_format=torch.channels_last)
     student.depth_encoder.module.precision = hidden_precision(cfg.precision, device)
@@ -141,7 +144,7 @@ def build(cfg: Config, trained: Trained) -> Components:
     augmentation = make_augmentation(cfg.augmentation, seeds.generator("augmentation"))
     glances = None
     if apart or (cfg.glance.images > 0 and cfg.init_from is None):
-        glances = Glances.of(student, cfg.glance, augmentation, seeds.generator("batches"))
+        glances = Glances.of(student, env.arena.layout.course, cfg.glance, augmentation, seeds.generator("batches"))
     imitation, place = cfg.imitation, cfg.imitation.place if teacher.settings["num_place"] else None
     return Components(
         seeds=seeds,
@@ -158,9 +161,9 @@ def build(cfg: Config, trained: Trained) -> Components:
             bits=cfg.bits,
             keep=(
                 *(keys.HEADING_ERROR, keys.OBSTACLE),
-                *([] if place is None else [keys.PLACE]),
+                *([] if place is None else [keys.PLACE, keys.PROGRESS]),
                 *([keys.SCANDOTS] if apart or imitation.latent is not None else []),
-                *([keys.PLACE] if apart else []),
+                *([keys.PLACE, keys.PROGRESS] if apart else []),
             ),
             keep_written=[keys.DEPTH_FEATURE] if apart else [],
             keep_next=("reward", keys.OUTCOME, keys.TERMINATIONS),
@@ -174,6 +177,7 @@ def build(cfg: Config, trained: Trained) -> Components:
             heading=imitation.heading,
             obstacle=imitation.obstacle,
             place=place,
+            progress=None if place is None else imitation.progress,
             latent=imitation.latent,
             compared=imitation.compared,
             heading_weights=imitation.heading_weights,
@@ -183,6 +187,11 @@ def build(cfg: Config, trained: Trained) -> Components:
         glances=glances,
         bbc=controller,
     )
+
+
+def frozen_parts(cfg: Config) -> tuple[str, ...]:
+    """What stays the teacher's: the estimator, since imitation shall not bend what says what can be measured."""
+    return ("estimator",) if cfg.imitation.actor else ("estimator", "history_encoder", "actor")
 
 
 def imitated(student: RecurrentStudent, glances: Glances | None) -> list[nn.Parameter]:
@@ -216,8 +225,8 @@ def applied(policy: TensorDictSequential) -> TensorDictSequential:
     return TensorDictSequential(*policy, clip)
 
 
-def load_student(parts: Components, path: Path) -> None:
-    """Start from another run's student, but for the estimator, which is that of this run's controller.
+def load_student(parts: Components, path: Path, kept: tuple[str, ...]) -> None:
+    """Start from another run's student, but for the parts that are kept: those that stay this run's teacher's.
 
     Raises:
         ArtifactError: if it is none, or has other sizes.
@@ -232,10 +241,12 @@ def load_student(parts: Components, path: Path) -> None:
         has, builds = ({name: sizes.get(name) for name in differ} for sizes in (own, wanted))
         raise ArtifactError(
             f"{trained.artifact.folder}: the student has {has}, this run builds {builds}; give the same --memory, "
-            "--encoder-channels, --encoder-hidden and --heading-gate, and a teacher of the same sizes"
+            "--encoder-channels, --encoder-hidden, --encoder-features, --heading-gate and --env.course, and a teacher "
+            "of the same sizes"
         )
-    own_estimator = {f"estimator.{name}": value for name, value in parts.student.estimator.state_dict().items()}
-    parts.student.load_state_dict(trained.network.state_dict() | own_estimator)
+    own_state = parts.student.state_dict()
+    own_parts = {name: value for name, value in own_state.items() if name.split(".")[0] in kept}
+    parts.student.load_state_dict(trained.network.state_dict() | own_parts)
 
 
 def annealed(first: float, last: float, iteration: int, length: int) -> float:

@@ -16,6 +16,7 @@ from agility_rl.deploy.depth import DepthPreprocessor, DepthSource
 from agility_rl.deploy.onnx import onnx_session
 from agility_rl.go2 import camera, features
 from agility_rl.modules import RecurrentStudent
+from agility_rl.modules.placed_memory import memory_parts
 from agility_rl.modules.student import PERCEIVED_HEADING, PERCEIVED_OBSTACLE, PERCEIVED_PLACE
 
 StudentNet = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
@@ -179,9 +180,12 @@ class DeployedStudent:
 
 
 def memory_size(artifact: Artifact) -> int:
-    """Numbers that a student remembers: the units of its GRU and, if it infers one, its place."""
+    """Numbers that a student remembers: the units of its GRU and, if it infers a place, all that it knows of that."""
     network = artifact.manifest["network"]
-    return int(network["memory"]) + int(network.get("num_place", 0))
+    units = int(network["memory"])
+    if not network.get("num_place"):
+        return units
+    return sum(memory_parts(units, sum(map(len, network["routes"])), len(network["way_points"][0])))
 
 
 def example_inputs(memory: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -179,6 +179,7 @@ class AgilityEnv(EnvBase):
                 keys.HEADING_ERROR: group(2),
                 keys.PLACE: group(NUM_PLACE),
                 keys.OBSTACLE: group(len(OBSTACLES)),
+                keys.PROGRESS: group(self.arena.progress.num_stages),
                 keys.SCANDOTS: group(NUM_SCANDOTS),
                 **outcome_specs(n, (*self.rewards, TERMINATION_TERM), self.terminations),
                 **({} if self.depth is None else {keys.DEPTH: Bounded(-0.5, 0.5, image, dtype=torch.float32)}),

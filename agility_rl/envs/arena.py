@@ -185,6 +185,7 @@ class Arena:
                 keys.HEADING_ERROR: self.heading_error(position, yaw)[1],
                 keys.PLACE: self.place(position, yaw),
                 keys.OBSTACLE: self.types[self.progress.obstacle].float(),
+                keys.PROGRESS: torch.nn.functional.one_hot(self.progress.stage, self.progress.num_stages).float(),
                 keys.SCANDOTS: self.scan.scandots(simulator.root_position, yaw, parameter),
             },
             [len(yaw)],

@@ -118,6 +118,18 @@ class Course:
         self._check_routes()
         self._check_places()
 
+    @property
+    def most_way_points(self) -> int:
+        """Way-points of the obstacle that has most."""
+        return max(len(slot.goals) for slot in self.slots)
+
+    @property
+    def legs(self) -> tuple[tuple[tuple[float, float, float], ...], ...]:
+        """Of every route, where its slots lie in the arena: x, y [m], yaw [rad]."""
+        return tuple(
+            tuple((*self.slots[index].position, self.slots[index].yaw) for index in route) for route in self.routes
+        )
+
     def _check_routes(self) -> None:
         n = len(self.slots)
         for route in self.routes:

@@ -13,7 +13,7 @@ from agility_rl.simulation import Piece, Shape
 
 _WALL = 0.05
 """Half thickness of a wall [m] (ours)."""
-_BUFFERS = ("position", "yaw", "lift", "route", "length", "wall_height")
+_BUFFERS = ("position", "yaw", "lift", "route", "length", "first_leg", "wall_height")
 
 
 class CourseLayout:
@@ -36,6 +36,7 @@ class CourseLayout:
         lift: ``[N, K]`` height of the lifted piece [m], 0 for obstacles without.
         route: int64 ``[N, L]``, obstacles in the order of passing.
         length: int64 ``[N]``, number of valid entries in a row of :attr:`route`.
+        first_leg: int64 ``[N]``, how many obstacles are in the routes that the course lists before the row's.
         wall_height: ``[N]`` [m].
         difficulty: share of every range of heights that is drawn from, 0 to 1; assign for a curriculum.
 
@@ -68,6 +69,7 @@ class CourseLayout:
         routes = [(*route, *(route[-1],) * (longest - len(route))) for route in course.routes]
         self._routes = torch.tensor(routes, device=device)
         self._lengths = torch.tensor([len(route) for route in course.routes], device=device)
+        self._first_legs = self._lengths.cumsum(0) - self._lengths
         self._wall_range = course.wall_height or (0.0, 0.0)
 
         self.difficulty = 1.0
@@ -76,6 +78,7 @@ class CourseLayout:
         self.lift = self._heights[:, 0].repeat(n, 1)
         self.route = self._routes[0].repeat(n, 1)
         self.length = self._lengths[0].repeat(n)
+        self.first_leg = self._first_legs[0].repeat(n)
         self.wall_height = torch.full((n,), self._wall_range[0], device=device)
 
     def draw(self, mask: Tensor) -> None:
@@ -94,7 +97,7 @@ class CourseLayout:
         route = slot.argsort(-1).gather(1, self._routes[choice])  # slots, then the obstacles that stand there
         walls = self._wall_range[0] + (self._wall_range[1] - self._wall_range[0]) * uniform(n)
         # New tensors, because observations of earlier steps may still refer to the old ones.
-        drawn = (place[..., :2], place[..., 2], lift, route, self._lengths[choice], walls)
+        drawn = (place[..., :2], place[..., 2], lift, route, self._lengths[choice], self._first_legs[choice], walls)
         for name, value in zip(_BUFFERS, drawn, strict=True):
             rows = mask.view(-1, *(1,) * (value.ndim - 1))
             setattr(self, name, torch.where(rows, value, getattr(self, name)))

@@ -59,7 +59,7 @@ class CourseProgress:
     def __init__(self, layout: CourseLayout, radius: float = GOAL_RADIUS) -> None:
         self.layout, self.radius, device = layout, radius, layout.device
         goals = [slot.goals for slot in layout.course.slots]
-        longest = max(map(len, goals))
+        self._longest = longest = layout.course.most_way_points
         filled = [(*points, *(points[-1],) * (longest - len(points))) for points in goals]
         self._points = torch.tensor(filled, device=device)
         self._count = torch.tensor([len(points) for points in goals], device=device)
@@ -88,6 +88,16 @@ class CourseProgress:
     def obstacle(self) -> Tensor:
         """Index of the current obstacle in the course, int64 ``[N]``."""
         return self._obstacle(self.leg)
+
+    @property
+    def stage(self) -> Tensor:
+        """Index of the current way-point among those of all obstacles of all routes, int64 ``[N]``."""
+        return (self.layout.first_leg + self.leg) * self._longest + self.point
+
+    @property
+    def num_stages(self) -> int:
+        """How many there are, if all obstacles had as many as the one that has most."""
+        return sum(map(len, self.layout.course.routes)) * self._longest
 
     def _obstacle(self, leg: Tensor) -> Tensor:
         last = torch.minimum(leg, self.end - 1)

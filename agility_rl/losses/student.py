@@ -21,6 +21,8 @@ from agility_rl.keys import (
     PARAMETERS,
     PLACE,
     PLACE_ESTIMATE,
+    PROGRESS,
+    PROGRESS_LOGITS,
     TERRAIN_LATENT,
 )
 from agility_rl.losses.keyed import KeyedLoss, parameter_device
@@ -31,7 +33,7 @@ class StudentLoss(KeyedLoss):
 
     .. math:: L = w_D \, \mathrm{CE}(\ell, a^D_T) + w_C \, E \| a^C_T - \mu \|_2
               + w_\psi \, E \| \mathrm{diag}(2, \tfrac12) (\Delta\psi - \widehat{\Delta\psi}) \|_2
-              + w_o \, \mathrm{CE}(\ell_o, o) + w_p \, E \| p - \hat p \|_1
+              + w_o \, \mathrm{CE}(\ell_o, o) + w_p \, E \| p - \hat p \|_1 + w_g \, \mathrm{CE}(\ell_g, g)
               + \tfrac{w_z}{32} \, E \| z_T - \hat z \|_2^2
 
     All coefficients are already applied to the losses returned. For a recurrent student give the policy that unrolls
@@ -39,8 +41,8 @@ class StudentLoss(KeyedLoss):
 
     Source: Eq. (15); form, norms and weights of the headings: released code (method notes, section 5.9). Different:
     cross-entropy of the obstacle on logits, not on probabilities; differences of headings are wrapped to (-pi, pi]; the
-    place (ours) is for students of teachers that read theirs; the last term (ours) compares the terrain latents
-    themselves, which the actor's gradient else has to find.
+    place and the progress on the course (ours) are for students of teachers that read their place; the last term (ours)
+    compares the terrain latents themselves, which the actor's gradient else has to find.
 
     Keys read:
         every entry of ``network.in_keys``
@@ -49,11 +51,13 @@ class StudentLoss(KeyedLoss):
         heading_error        float32 ``[*B, 2]`` [rad]
         obstacle             float32 ``[*B, O]``, one-hot
         place                float32 ``[*B, 8]``      with a coefficient of the place
+        progress             float32 ``[*B, S]``, one-hot, with that coefficient
         (label, terrain_latent)  float32 ``[*B, 32]`` the teacher's, with a coefficient of the latent
     Keys written (``[]`` each; losses ``[*B]`` with ``reduction="none"``):
-        loss_behaviour, loss_parameters, loss_heading, loss_obstacle, loss_place, loss_latent  only those with a
+        loss_behaviour, loss_parameters, loss_heading, loss_obstacle, loss_place, loss_progress,
+        loss_latent                            only those with a
                                                coefficient
-        accuracy_behaviour, accuracy_obstacle  share that agrees, detached
+        accuracy_behaviour, accuracy_obstacle, accuracy_progress  share that agrees, detached
         error_heading                          mean absolute error to the current way-point [rad], detached
         error_place                            mean absolute error of the current way-point's x and y [m], detached
 
@@ -65,6 +69,7 @@ class StudentLoss(KeyedLoss):
         heading: coefficient of the headings; schedulable.
         obstacle: coefficient of the obstacle; schedulable.
         place: coefficient of the place; schedulable. The network then writes place estimates ``[*B, 8]`` too.
+        progress: coefficient of the progress; schedulable. The network then writes ``progress_logits`` ``[*B, S]`` too.
         latent: coefficient of the terrain latent; schedulable. The network then writes ``terrain_latent`` too.
         compared: parameters of ``"all"`` choices, as released, or of the one that the teacher ``"selected"``.
         heading_weights: of the errors to the current and the next way-point.
@@ -94,12 +99,14 @@ class StudentLoss(KeyedLoss):
             heading_estimate (NestedKey): what the network writes, ``[*B, 2]``.
             obstacle_logits (NestedKey): what the network writes, ``[*B, O]``.
             place_estimate (NestedKey): what the network writes, ``[*B, 8]``.
+            progress_logits (NestedKey): what the network writes, ``[*B, S]``.
             terrain_latent (NestedKey): what the network writes, ``[*B, 32]``.
             behaviour (NestedKey): the teacher's choice.
             parameters (NestedKey): the teacher's parameters.
             heading_error (NestedKey): true heading errors.
             obstacle (NestedKey): true obstacle, one-hot.
             place (NestedKey): true place.
+            progress (NestedKey): true way-point, one-hot.
             latent (NestedKey): the teacher's terrain latent.
         """
 
@@ -108,12 +115,14 @@ class StudentLoss(KeyedLoss):
         heading_estimate: NestedKey = HEADING_ESTIMATE
         obstacle_logits: NestedKey = OBSTACLE_LOGITS
         place_estimate: NestedKey = PLACE_ESTIMATE
+        progress_logits: NestedKey = PROGRESS_LOGITS
         terrain_latent: NestedKey = TERRAIN_LATENT
         behaviour: NestedKey = (LABEL, BEHAVIOUR)
         parameters: NestedKey = (LABEL, PARAMETERS)
         heading_error: NestedKey = HEADING_ERROR
         obstacle: NestedKey = OBSTACLE
         place: NestedKey = PLACE
+        progress: NestedKey = PROGRESS
         latent: NestedKey = (LABEL, TERRAIN_LATENT)
 
     default_keys = _AcceptedKeys
@@ -121,7 +130,7 @@ class StudentLoss(KeyedLoss):
     network: TensorDictModule
     network_params: TensorDictParams
     target_network_params: TensorDictParams
-    _schedulable_buffers = frozenset({"behaviour", "continuous", "heading", "obstacle", "place", "latent"})
+    _schedulable_buffers = frozenset({"behaviour", "continuous", "heading", "obstacle", "place", "progress", "latent"})
 
     def __init__(
         self,
@@ -132,6 +141,7 @@ class StudentLoss(KeyedLoss):
         heading: float | None = 1.0,
         obstacle: float | None = 1.0,
         place: float | None = None,
+        progress: float | None = None,
         latent: float | None = None,
         compared: Literal["all", "selected"] = "all",
         heading_weights: tuple[float, float] = (2.0, 0.5),
@@ -139,7 +149,7 @@ class StudentLoss(KeyedLoss):
     ) -> None:
         super().__init__()
         coefficients = {"behaviour": behaviour, "continuous": continuous, "heading": heading, "obstacle": obstacle}
-        coefficients |= {"place": place, "latent": latent}
+        coefficients |= {"place": place, "progress": progress, "latent": latent}
         if all(value is None for value in coefficients.values()):
             raise ValueError(f"at least one of {', '.join(coefficients)} must be a number, got none")
         if compared not in ("all", "selected"):
@@ -164,6 +174,7 @@ class StudentLoss(KeyedLoss):
             (self.heading, keys.heading_error),
             (self.obstacle, keys.obstacle),
             (self.place, keys.place),
+            (self.progress, keys.progress),
             (self.latent, keys.latent),
         ):
             if coefficient is not None:
@@ -185,6 +196,8 @@ class StudentLoss(KeyedLoss):
             names += ["loss_obstacle", "accuracy_obstacle"]
         if self.place is not None:
             names += ["loss_place", "error_place"]
+        if self.progress is not None:
+            names += ["loss_progress", "accuracy_progress"]
         if self.latent is not None:
             names += ["loss_latent"]
         return names
@@ -213,14 +226,17 @@ class StudentLoss(KeyedLoss):
             out.set("loss_heading", self.heading * self._reduce_loss(error, tensordict))
             out.set("error_heading", difference.detach()[..., 0].abs().mean())
         if self.obstacle is not None:
-            logits, kind = written.get(keys.obstacle_logits), tensordict.get(keys.obstacle).argmax(-1)
-            error = _cross_entropy(logits, kind)
+            error, right = _classified(written.get(keys.obstacle_logits), tensordict.get(keys.obstacle))
             out.set("loss_obstacle", self.obstacle * self._reduce_loss(error, tensordict))
-            out.set("accuracy_obstacle", (logits.detach().argmax(-1) == kind).float().mean())
+            out.set("accuracy_obstacle", right)
         if self.place is not None:
             distance = (tensordict.get(keys.place).detach() - written.get(keys.place_estimate)).abs()
             out.set("loss_place", self.place * self._reduce_loss(distance.sum(-1), tensordict))
             out.set("error_place", distance.detach()[..., :2].mean())
+        if self.progress is not None:
+            error, right = _classified(written.get(keys.progress_logits), tensordict.get(keys.progress))
+            out.set("loss_progress", self.progress * self._reduce_loss(error, tensordict))
+            out.set("accuracy_progress", right)
         if self.latent is not None:
             error = (tensordict.get(keys.latent).detach() - written.get(keys.terrain_latent)).square().mean(-1)
             out.set("loss_latent", self.latent * self._reduce_loss(error, tensordict))
@@ -231,6 +247,12 @@ class StudentLoss(KeyedLoss):
 def _cross_entropy(logits: Tensor, index: Tensor) -> Tensor:
     """``[*B, K]`` and ``[*B]`` to ``[*B]``."""
     return functional.cross_entropy(logits.flatten(0, -2), index.flatten(), reduction="none").reshape(index.shape)
+
+
+def _classified(logits: Tensor, one_hot: Tensor) -> tuple[Tensor, Tensor]:
+    """Cross-entropy ``[*B]``, and the share that is right."""
+    kind = one_hot.argmax(-1)
+    return _cross_entropy(logits, kind), (logits.detach().argmax(-1) == kind).float().mean()
 
 
 def _wrap(angle: Tensor) -> Tensor:

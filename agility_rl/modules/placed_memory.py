@@ -1,44 +1,75 @@
-"""A memory that knows how far the robot has gone: dead reckoning between what a network says of its place."""
+"""A memory that knows where the robot stands: dead reckoning, corrected by what images say."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from agility_rl.go2 import features
+from agility_rl.modules.glance import NUM_POSE, NUM_SCALES, Glance
 from agility_rl.modules.mlp import mlp
+from agility_rl.modules.planar import bearings, inverse, inverted, moved, planar_motion, seen_from, within
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 
 NUM_PLACE = 8
 """Way-point, the next one, and the robot's place at the obstacle (:data:`agility_rl.keys.PLACE`)."""
-REACHED = 0.45
-"""Distance at which a student's way-point is reached [m] (method notes, section 5.5)."""
-GAIN = -1.5
-"""Added to the gains' logits: at the start a fifth of what the network says is believed at each decision."""
+NEAR = 0.38
+"""Distance at which a way-point is taken for reached [m]; see :func:`reached`."""
+DRIFT = (0.05**2, 0.05**2, 0.01**2)
+"""Variance that counting the way adds in a second: ahead, aside [m^2], yaw [rad^2]; measured (docs/student.md)."""
+START = (0.15**2, 0.45**2, 0.2**2)
+"""Variance where an episode starts, 2 m before an obstacle and up to 0.4 rad turned: that of the draw, twice as wide as
+the released one (method notes, section 5.7)."""
+NEXT = (0.2**2, 0.29**2, 0.07**2)
+"""Variance that the jitter of an obstacle and of the next one adds (section 5.7): 0.15 m along, 0.25 m across and 0.087
+rad at most, of each; what stands 4 m behind one that is turned so far is 0.35 m aside."""
+ALIKE = 2.7
+"""Logarithm of how many images in a row count as one at the start: their errors are alike."""
+CREDIT = -4.0
+"""Added to the logit of the evidence's share: at the start a second of images, much alike, counts as half of one."""
+DOUBT = 1e-3
+"""Share of the belief in a way-point that goes to each neighbour, so that what is seen later can speak for that."""
+CERTAIN = 8.0
+"""Logit of the way-point where an episode starts."""
 
-_ROLL_PITCH = features.layout_slice(features.PROPRIOCEPTION_LAYOUT, "roll_pitch")
-_ANGULAR = features.layout_slice(features.PROPRIOCEPTION_LAYOUT, "angular_velocity")
-_LINEAR = features.layout_slice(features.EXPLICIT_LAYOUT, "linear_velocity")
+
+def memory_parts(hidden_size: int, legs: int, points: int) -> tuple[int, int, int, int]:
+    """Numbers of the memory: of the GRU, the pose, its uncertainty, and the way-points that it may be on the way to.
+
+    Example:
+        >>> memory_parts(256, legs=6, points=4)
+        (256, 4, 3, 24)
+    """
+    return hidden_size, NUM_POSE, NUM_SCALES, legs * points
 
 
 class PlacedMemory(nn.Module):
-    r"""Remember, and know the place in metres by a filter whose gains a GRU learns.
+    r"""Remember, and know the place in metres: dead reckoning, corrected by a Kalman filter by what images say.
 
-    .. math:: \bar p_t &= T_{t - 1/2}^{t}\, p^+_{t - 1}, \qquad
-              \tilde p_t = (1 - s_t)\, \bar p_t + s_t\, S \bar p_t, \\
-              p_t &= \tilde p_t + k_t \odot (m_t - \tilde p_t), \qquad
-              p^+_t = T_{t}^{t + 1/2}\, p_t
+    .. math:: \bar p_t &= T_{t - 1/2}^{t}\, p^+_{t - 1}, \qquad \bar P_t = P_{t - 1} + Q, \qquad
+              p^+_t = T_{t}^{t + 1/2}\, p_t \\
+              b_t &\propto \left(b_{t - 1} + (N - 1)\, \lambda_t \odot b_{t - 1}\right) D
+              \odot \exp(\kappa_t\, e_t)
 
-    T moves a place by half a decision's motion, as gyroscope, attitude and estimated velocity give it
-    (:func:`planar_motion`, :func:`moved`). S puts the next way-point in the first one's place, where that one is
-    :func:`reached` or the GRU says so. The gains k and s in (0, 1) and the place m are read from a GRU, which sees the
-    image's feature, proprioception and :math:`\bar p_t`. What the feature says by itself, by a linear map (``glance``),
-    is added to terrain latent, obstacle and m. For the way-points m is a mean of what was said and of those of the
-    likeliest obstacle as they lie from its place (:func:`seen_from`), with shares that the GRU gives (:func:`chosen`).
-    Who has seen nothing has a place of zeros, that no robot can have, since sine and cosine are 0.
+    p is the robot's pose in the arena, P the variance of its numbers. T moves it by half a decision's motion, as
+    gyroscope, attitude and estimated velocity give it (:func:`~agility_rl.modules.planar.planar_motion`,
+    :func:`~agility_rl.modules.planar.moved`); Q is what that adds in uncertainty. A
+    :class:`~agility_rl.modules.glance.Glance` says where the obstacle ahead is seen and how sure that is, by which the
+    pose is :func:`corrected`. A GRU, which sees the feature, proprioception, what is expected of the place, and b, says
+    how many images in a row count as one, and adds to what the glance says of terrain latent, obstacle and e.
 
-    Source: ours; prediction and correction are those of a Kalman filter (Kalman 1960, doi:10.1115/1.3662552). Sizes of
-    fusion and GRU: method notes, section 5.9.
+    The course is known but for its jitter and the order of its obstacles. b is the belief of a hidden Markov model in
+    the way-point that is the present one, of all obstacles of all routes: N goes on to the next one, :math:`\lambda`
+    says of each whether it is :func:`reached`, D leaves some doubt for its neighbours, and the evidence e counts by a
+    share :math:`\kappa`, since images in a row are much alike. The likeliest way-point says which obstacle the pose is
+    seen from and corrected by, as if that stood where it should. The place then is where the way-points of that type of
+    obstacle lie from there (:func:`~agility_rl.modules.planar.seen_from`). Who has seen nothing stands before the first
+    obstacle.
+
+    Source: ours; prediction and correction are those of a Kalman filter (Kalman 1960, doi:10.1115/1.3662552) and of a
+    hidden Markov model's forward algorithm (Rabiner 1989, doi:10.1109/5.18626, Eq. 19 and 20). Sizes of fusion and GRU:
+    method notes, section 5.9.
 
     Args:
         features: of an image.
@@ -47,19 +78,32 @@ class PlacedMemory(nn.Module):
         num_obstacles: types of obstacles.
         period: of a decision [s].
         way_points: ``[K, W, 2]``, of every type of obstacle, in its frame [m].
+        routes: of every route of the course, where its obstacles stand in the arena: x, y [m], yaw [rad]
+            (:attr:`agility_rl.envs.Course.legs`).
 
     Attributes:
-        size: of the memory: units of the GRU, and the place after half a decision more.
+        size: of the memory: units of the GRU, the pose half a decision later, the variances of x, y and yaw, and the
+            belief in L x W way-points as logits, the last three less what they are before the first obstacle.
 
     Example:
-        >>> memory = PlacedMemory(32, 45, 16, 7, 0.04, torch.zeros(7, 4, 2))
+        >>> memory = PlacedMemory(32, 45, 16, 7, 0.04, torch.zeros(7, 4, 2), [[(2.0, 3.0, 1.57), (2.0, 7.0, 1.57)]])
         >>> outputs = memory(torch.zeros(5, 3, 32), torch.zeros(5, 3, 45), torch.zeros(5, 3, 4),
-        ...     torch.zeros(5, 3, 24), torch.zeros(5, 3, 1, dtype=torch.bool))
+        ...     torch.zeros(5, 3, memory.size), torch.zeros(5, 3, 1, dtype=torch.bool))
         >>> [tuple(output.shape) for output in outputs]
-        [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 24), (5, 3, 8)]
+        [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 31), (5, 3, 8), (5, 3, 8)]
     """
 
     way_points: Tensor
+    entry: Tensor
+    legs: Tensor
+    arena: Tensor
+    following: Tensor
+    doubt: Tensor
+    prior: Tensor
+    starts: Tensor
+    drift: Tensor
+    uncertain: Tensor
+    jitter: Tensor
 
     def __init__(
         self,
@@ -69,187 +113,205 @@ class PlacedMemory(nn.Module):
         num_obstacles: int,
         period: float,
         way_points: Tensor,
+        routes: Sequence[Sequence[Sequence[float]]] = (((0.0, 0.0, 0.0),),),
     ) -> None:
         super().__init__()
-        self.size, self.hidden_size, self.period = hidden_size + NUM_PLACE, hidden_size, period
-        self.fusion = mlp(features + measured + NUM_PLACE, (128,), 32)
+        legs, points = sum(map(len, routes)), way_points.shape[1]
+        count = legs * points
+        ends = [points * sum(map(len, routes[: index + 1])) - 1 for index in range(len(routes))]
+        firsts = [index == 0 or index - 1 in ends for index in range(count)]
+        following = torch.tensor([index if index in ends else index + 1 for index in range(count)])
+        preceding = torch.tensor([index if firsts[index] else index - 1 for index in range(count)])
+        self.hidden_size, self.period, self.points = hidden_size, period, points
+        self.parts = memory_parts(hidden_size, legs, points)
+        self.size = sum(self.parts)
+        self.fusion = mlp(features + measured + NUM_POSE + legs + points, (128,), 32)
         self.cell = nn.GRUCell(32, hidden_size)
-        self.register_buffer("way_points", way_points, persistent=False)
-        shares = 2 * (way_points.shape[1] + 1)
-        self.sizes = (NUM_TERRAIN_LATENT + num_obstacles + NUM_PLACE, NUM_PLACE + 1, shares)
-        self.head = mlp(hidden_size, (), sum(self.sizes))
-        self.glance = mlp(features, (), self.sizes[0])
+        self.known = (NUM_TERRAIN_LATENT, num_obstacles, count)
+        self.head = mlp(hidden_size, (), sum(self.known) + NUM_SCALES + 1)
+        self.glance = Glance(features, self.known, legs)
+
+        stay, frames = torch.eye(count), torch.tensor([leg for route in routes for leg in route])
+        entry = way_points[:, 0].mean(0, keepdim=True)
+        before = torch.cat((entry[0], torch.tensor([0.0, 1.0])))
+        constants = {
+            "way_points": way_points,
+            "entry": entry,
+            "legs": frames,
+            "arena": inverse(frames),
+            "following": following,
+            "doubt": (1.0 - 2.0 * DOUBT) * stay + DOUBT * (stay[following] + stay[preceding]),
+            "prior": CERTAIN * torch.tensor(firsts).float(),
+            "starts": within(before, inverse(frames)),
+            "drift": period * torch.tensor(DRIFT),
+            "uncertain": torch.tensor(START),
+            "jitter": torch.tensor(NEXT),
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value, persistent=False)
 
     def forward(
-        self, feature: Tensor, proprioception: Tensor, estimate: Tensor, hidden: Tensor, is_init: Tensor
+        self,
+        feature: Tensor,
+        proprioception: Tensor,
+        estimate: Tensor,
+        hidden: Tensor,
+        is_init: Tensor,
+        start: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """Steps of ``[T, *B]``: terrain latent, heading errors [rad], obstacle logits, memory after each step, place.
+        """Steps of ``[T, *B]``: terrain latent, heading errors [rad], obstacle logits, memory after, place, progress.
 
-        Of ``hidden`` only the first step's counts; it begins with zeros where ``is_init`` says so.
+        The last are log-probabilities. Of ``hidden`` only the first step's counts; it begins as :meth:`begun` does.
         """
         state, steps = hidden[0], []
-        for measured in zip(feature, proprioception, estimate, is_init, strict=True):
-            state = state.masked_fill(measured[-1], 0.0)
-            steps.append(self.step(*measured[:-1], state))
+        for time, measured in enumerate(zip(feature, proprioception, estimate, strict=True)):
+            state = self.begun(state, is_init[time], None if start is None else start[time])
+            steps.append(self.step(*measured, state))
             state = steps[-1][3]
         return tuple(torch.stack(outputs) for outputs in zip(*steps, strict=True))
 
+    def begun(self, hidden: Tensor, is_init: Tensor, start: Tensor | None = None) -> Tensor:
+        """Memory ``[*B, M]``, empty where a bool mask ``[*B, 1]`` says that an episode begins.
+
+        It begins before the first obstacle, or with the way-point ``start``, one-hot ``[*B, L W]``.
+        """
+        if start is None:
+            return hidden.masked_fill(is_init, 0.0)
+        empty = hidden.new_zeros(*hidden.shape[:-1], self.hidden_size)
+        pose = self._marginals(start)[0] @ self.starts - self.starts[0]
+        return torch.where(
+            is_init, torch.cat((empty, pose, empty[..., :NUM_SCALES], CERTAIN * start - self.prior), -1), hidden
+        )
+
     def step(self, feature: Tensor, proprioception: Tensor, estimate: Tensor, hidden: Tensor) -> tuple[Tensor, ...]:
         """One step of ``[*B]``, with outputs as :meth:`forward`."""
-        remembered, place = hidden.split((self.hidden_size, NUM_PLACE), -1)
+        remembered, pose, variance, belief = hidden.split(self.parts, -1)
+        belief = (belief + self.prior).softmax(-1)
+        variance = (variance + self.uncertain).clamp(min=0.0) + self.drift
         motion = 0.5 * self.period * planar_motion(proprioception, estimate)
-        place = moved(place, motion)
-        fused = self.fusion(torch.cat((feature, proprioception, place.detach()), -1))
-        batch = fused.shape[:-1]
-        remembered = self.cell(fused.reshape(-1, 32), remembered.reshape(-1, self.hidden_size)).reshape(*batch, -1)
-        known, gains, shares = self.head(remembered).split(self.sizes, -1)
-        latent, logits, said = (known + self.glance(feature)).tensor_split((NUM_TERRAIN_LATENT, -NUM_PLACE), -1)
-        gain, switch = (gains + GAIN).split((NUM_PLACE, 1), -1)
-        gain, switch = gain.sigmoid(), (switch + reached(place)).sigmoid()
-        place = torch.lerp(place, torch.cat((place[..., 2:4], place[..., 2:]), -1), switch)
-        obstacle = torch.lerp(place[..., 4:], said[..., 4:], gain[..., 4:])
-        candidates = seen_from(obstacle, self.way_points[logits.argmax(-1)])
-        goals = torch.lerp(place[..., :4], chosen(shares, candidates, said[..., :4]), gain[..., :4])
-        place = torch.cat((goals, obstacle), -1)
-        after = torch.cat((remembered, moved(place, motion)), -1)
-        return latent.tanh(), bearings(place), logits, after, place
+        pose = moved(pose + self.starts[0], motion)
+        at = within(pose, self.legs)  # at the obstacle of every leg
+        before = belief.argmax(-1) // self.points
+        expected = torch.cat((of_leg(at, before), *self._marginals(belief)), -1)
+        remembered = self._remember(torch.cat((feature, proprioception, expected.detach()), -1), remembered)
+        known, alike, weight = self.head(remembered).split((sum(self.known), NUM_SCALES, 1), -1)
+        latent, logits, evidence = (known + self.glance.what(feature)).split(self.known, -1)
+        points = torch.einsum("...k,kwc->...wc", logits.detach().softmax(-1), self.way_points)
+
+        done = reached(points[..., None, :, :] - at[..., None, :2]).flatten(-2)
+        belief = (belief * (-done).sigmoid()).index_add(-1, self.following, belief * done.sigmoid())
+        belief = (belief @ self.doubt).clamp(min=1e-30)
+        progress = (belief.log() + (weight + CREDIT).sigmoid() * evidence).log_softmax(-1)
+        now = progress.argmax(-1)
+        leg = now // self.points
+        variance = torch.where((leg != before)[..., None], variance + self.jitter, variance)
+        ahead = inverted(of_leg(at, leg))
+        said, scale = self.glance.where(feature, ahead, leg)
+        ahead, variance = corrected(ahead, variance, said, scale + 0.5 * (alike + ALIKE))
+        obstacle = inverted(ahead)
+        pose = of_leg(within(obstacle, self.arena), leg)
+        place = torch.cat((self._goals(now, pose, obstacle, points), obstacle), -1)
+        after = (remembered, moved(pose, motion) - self.starts[0], variance - self.uncertain, progress - self.prior)
+        return latent.tanh(), bearings(place), logits, torch.cat(after, -1), place, progress
+
+    def _remember(self, inputs: Tensor, remembered: Tensor) -> Tensor:
+        fused = self.fusion(inputs)
+        cells = self.cell(fused.reshape(-1, fused.shape[-1]), remembered.reshape(-1, self.hidden_size))
+        return cells.reshape(remembered.shape)
+
+    def _goals(self, now: Tensor, pose: Tensor, obstacle: Tensor, points: Tensor) -> Tensor:
+        """The way-point ``now`` and the one after it, seen from the robot: ``[*B, 4]``."""
+        following = self.following[now]
+        coming = of_leg(within(pose, self.legs), following // self.points)
+        # After the last way-point of an obstacle, whose type nobody knows yet, comes where obstacles are entered.
+        candidates = torch.cat((seen_from(obstacle, points), seen_from(coming, self.entry)), -2)
+        first = now % self.points
+        second = torch.where(following == now, first, first + 1)
+        return candidates.take_along_dim(torch.stack((first, second), -1)[..., None], -2).flatten(-2)
+
+    def _marginals(self, belief: Tensor) -> tuple[Tensor, Tensor]:
+        """Of legs ``[*B, L]``, and of how many way-points of an obstacle are reached ``[*B, W]``."""
+        belief = belief.unflatten(-1, (-1, self.points))
+        return belief.sum(-1), belief.sum(-2)
 
 
-def seen_from(obstacle: Tensor, points: Tensor) -> Tensor:
-    """Points of an obstacle's frame in the frame of a robot there.
+def of_leg(poses: Tensor, leg: Tensor) -> Tensor:
+    """Of poses ``[*B, L, 4]`` that of a leg each, int64 ``[*B]``: ``[*B, 4]``."""
+    return poses.take_along_dim(leg[..., None, None], -2)[..., 0, :]
 
-    Source: ours; a shift and a turn of the plane.
+
+def corrected(expected: Tensor, variance: Tensor, said: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Where an obstacle is seen and the variance of that, after something was said of it, with how sure that is.
+
+    .. math:: k = \frac{\bar P}{\bar P + 2 e^{2 s}}\, c(m, \bar o), \qquad o = \bar o + k\, (m - \bar o), \qquad
+              P = (1 - k)\, \bar P
+
+    Sine and cosine of the yaw share a variance. What is said of a place far from the one expected is of another
+    obstacle: c is how :func:`credible` it is.
+
+    Source: Kalman 1960 (doi:10.1115/1.3662552); :math:`2 e^{2 s}` is the variance of Laplace's distribution.
 
     Args:
-        obstacle: ``[*B, 4]``: x, y [m], sine and cosine of the robot's yaw, in the obstacle's frame.
-        points: ``[*B, W, 2]`` [m].
-
-    Returns:
-        ``[*B, W, 2]``, ahead and to the left [m].
+        expected: ``[*B, 4]``: x, y [m], sine and cosine of the yaw of the obstacle, seen by the robot.
+        variance: ``[*B, 3]``, of x, y [m^2] and yaw [rad^2].
+        said: ``[*B, 4]``, as the first.
+        scale: ``[*B, 3]``, logarithm of how far that is off on average.
 
     Example:
-        >>> seen_from(torch.tensor([-2.0, 0.0, 1.0, 0.0]), torch.tensor([[1.0, 0.5]]))  # turned to the left
-        tensor([[ 0.5000, -3.0000]])
+        >>> here, there = torch.tensor([2.0, 0.0, 0.0, 1.0]), torch.tensor([2.1, 0.1, 0.0, 1.0])
+        >>> place, variance = corrected(here, torch.full((3,), 0.02), there, torch.tensor([0.1, 0.3, 1.0]).log())
+        >>> place.round(decimals=2), variance.round(decimals=3)
+        (tensor([2.0500, 0.0100, 0.0000, 1.0000]), tensor([0.0100, 0.0180, 0.0200]))
     """
-    x, y = (points - obstacle[..., None, :2]).unbind(-1)
-    sine, cosine = obstacle[..., None, 2], obstacle[..., None, 3]
-    return torch.stack((cosine * x + sine * y, cosine * y - sine * x), -1)
+    gain = variance / (variance + 2.0 * (2.0 * scale).exp()) * credible(said, expected)
+    position, yaw = torch.lerp(expected, said, torch.cat((gain, gain[..., 2:]), -1)).split(2, -1)
+    return torch.cat((position, nn.functional.normalize(yaw, dim=-1)), -1), (1.0 - gain) * variance
 
 
-def chosen(shares: Tensor, candidates: Tensor, said: Tensor) -> Tensor:
-    r"""The way-point and the next one, means of candidates and of what was said.
+def credible(said: Tensor, expected: Tensor) -> Tensor:
+    r"""How far something said of an obstacle's place is believed, by its distance from what was expected.
 
-    .. math:: g_i = \sum_w a_{iw} c_w + a_{i, W + 1}\, m_i, \qquad a_i = \mathrm{softmax}(\ell_i)
+    .. math:: 1 / (1 + d^4 / 1\,\mathrm{m}^4)
 
-    Source: ours.
+    Source: ours; a soft form of the validation gate of target tracking.
 
     Args:
-        shares: ``[*B, 2 (W + 1)]``, logits; those of what was said come last.
-        candidates: ``[*B, W, 2]`` [m].
-        said: ``[*B, 4]`` [m].
-
-    Returns:
-        ``[*B, 4]`` [m].
-
-    Example:
-        >>> candidates, said = torch.tensor([[1.0, 0.0], [2.0, 0.0]]), torch.tensor([0.0, 0.0, 0.0, 7.0])
-        >>> chosen(torch.tensor([99.0, 0.0, 0.0, 0.0, 0.0, 99.0]), candidates, said).round(decimals=3)
-        tensor([1., 0., 0., 7.])
-    """
-    weights = shares.unflatten(-1, (2, -1)).softmax(-1)  # [*B, 2, W + 1]
-    return (weights[..., :-1] @ candidates + weights[..., -1:] * said.unflatten(-1, (2, 2))).flatten(-2)
-
-
-def reached(place: Tensor) -> Tensor:
-    r"""How much speaks for the next way-point, as a logit.
-
-    .. math:: (0.45 - \| p_{1:2} \|) / 0.04 \quad \text{within} \pm 8
-
-    Source: ours; the radius is that in which a student's way-point is reached (method notes, section 5.5).
-
-    Args:
-        place: ``[*B, 8]``.
+        said: ``[*B, 4]``: x, y [m] first.
+        expected: ``[*B, 4]``, as the first.
 
     Returns:
         ``[*B, 1]``, without gradient.
 
     Example:
-        >>> reached(torch.tensor([0.0, 0.41, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0])).round(decimals=3)
-        tensor([1.])
+        >>> here = torch.tensor([0.0, 0.0, 0.0, 1.0])
+        >>> [round(credible(torch.tensor([x, 0.0, 0.0, 1.0]), here).item(), 3) for x in (0.3, 1.0, 4.0)]
+        [0.992, 0.5, 0.004]
     """
-    distance = torch.linalg.vector_norm(place[..., :2].detach(), dim=-1, keepdim=True)
-    return ((REACHED - distance) / 0.04).clamp(-8.0, 8.0)
+    distance = torch.linalg.vector_norm((said - expected)[..., :2].detach(), dim=-1, keepdim=True)
+    return 1.0 / (1.0 + distance**4)
 
 
-def planar_motion(proprioception: Tensor, estimate: Tensor) -> Tensor:
-    r"""Velocity of a robot over the ground, in the frame of its heading.
+def reached(offset: Tensor) -> Tensor:
+    r"""How much speaks for it that a way-point is reached, as a logit: it is near, or just behind.
 
-    .. math:: v_{xy} = (R_y(\theta) R_x(\phi) v)_{xy}, \qquad
-              \dot\psi = (\omega_y \sin\phi + \omega_z \cos\phi) / \cos\theta
+    .. math:: \max\left(0.38 - d,\ \min(-x - 0.15,\ 0.5 - |y|)\right) / 0.02 \quad \text{within} \pm 8
 
-    Source: kinematics of Euler angles (yaw, pitch, roll); ours.
+    The radius is 0.45 m (method notes, section 5.5); who does not know his place to the decimetre does well to go
+    nearer, since a way-point wrongly taken for reached is never reached. One that he has passed should have been.
+
+    Source: ours.
 
     Args:
-        proprioception: ``[*B, 45]``: roll and pitch [rad], angular velocity in the base frame.
-        estimate: ``[*B, 4]``: linear velocity in the base frame (:data:`agility_rl.keys.ESTIMATE`).
+        offset: ``[*B, 2]``, from the robot to it, along and across the obstacle [m].
 
     Returns:
-        ``[*B, 3]``: forward and to the left [m/s], yaw rate [rad/s].
+        ``[*B]``, without gradient.
 
     Example:
-        >>> proprioception, estimate = torch.zeros(45), torch.tensor([0.3, 0.5, 0.0, 0.0])  # 1 m/s forward
-        >>> planar_motion(proprioception, estimate)
-        tensor([1., 0., 0.])
+        >>> reached(torch.tensor([[0.0, 0.36], [0.45, 0.0], [-0.17, 0.4], [-3.0, 0.9]])).round(decimals=3)
+        tensor([ 1.0000, -3.5000,  1.0000, -8.0000])
     """
-    roll, pitch = proprioception[..., _ROLL_PITCH].unbind(-1)
-    _, rate_y, rate_z = (proprioception[..., _ANGULAR] / features.ANGULAR_VELOCITY_SCALE).unbind(-1)
-    x, y, z = (estimate[..., _LINEAR] / features.LINEAR_VELOCITY_SCALE).unbind(-1)
-    down = roll.sin() * y + roll.cos() * z
-    yaw_rate = (rate_y * roll.sin() + rate_z * roll.cos()) / pitch.cos().clamp(min=0.2)  # nobody walks so steeply
-    return torch.stack((pitch.cos() * x + pitch.sin() * down, roll.cos() * y - roll.sin() * z, yaw_rate), -1)
-
-
-def moved(place: Tensor, motion: Tensor) -> Tensor:
-    """A place after the robot has moved: turned and shifted.
-
-    Source: ours; a rotation and a translation of the plane.
-
-    Args:
-        place: ``[*B, 8]`` (:data:`agility_rl.keys.PLACE`).
-        motion: ``[*B, 3]``: forward and to the left [m], counterclockwise [rad].
-
-    Example:
-        >>> ahead = torch.tensor([2.0, 0.0, 3.0, 1.0, -2.0, 0.0, 0.0, 1.0])  # 2 m before an obstacle, on its axis
-        >>> moved(ahead, torch.tensor([0.5, 0.0, 0.0]))
-        tensor([ 1.5000,  0.0000,  2.5000,  1.0000, -1.5000,  0.0000,  0.0000,  1.0000])
-    """
-    forward, left, turn = motion.unbind(-1)
-    x, y, next_x, next_y, at, aside, sine, cosine = place.unbind(-1)
-    cos, sin = turn.cos(), turn.sin()
-
-    def turned(ahead: Tensor, beside: Tensor) -> tuple[Tensor, Tensor]:
-        ahead, beside = ahead - forward, beside - left
-        return cos * ahead + sin * beside, cos * beside - sin * ahead
-
-    return torch.stack(
-        (
-            *turned(x, y),
-            *turned(next_x, next_y),
-            *(at + cosine * forward - sine * left, aside + sine * forward + cosine * left),
-            *(sine * cos + cosine * sin, cosine * cos - sine * sin),
-        ),
-        -1,
-    )
-
-
-def bearings(place: Tensor) -> Tensor:
-    """Heading errors to the way-points of a place ``[*B, 8]``, ``[*B, 2]`` [rad]; without gradient.
-
-    Source: definition of the heading error (method notes, section 5.5).
-
-    Example:
-        >>> bearings(torch.tensor([1.0, 1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
-        tensor([0.7854, 0.0000])
-    """
-    place = place.detach()
-    return torch.atan2(place[..., 1:4:2], place[..., 0:3:2])
+    offset = offset.detach()
+    near = NEAR - torch.linalg.vector_norm(offset, dim=-1)
+    behind = torch.minimum(-offset[..., 0] - 0.15, 0.5 - offset[..., 1].abs())
+    return (torch.maximum(near, behind) / 0.02).clamp(-8.0, 8.0)

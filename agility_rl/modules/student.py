@@ -52,11 +52,13 @@ class RecurrentStudent(nn.Module):
     the episode (the release carries it on).
 
     Keys read: ``depth`` [*B, 58, 87], ``proprioception`` [*B, 45], ``history`` [*B, 10, 45], ``hidden`` [*B, 512]
-    (520 with ``num_place``),
-    ``is_init`` bool [*B, 1], true in the first step of an episode; with assistance ``heading_error`` [*B, 2] too.
-    Keys written: ``depth_feature`` [*B, 32], ``terrain_latent`` [*B, 32], ``heading_estimate`` [*B, 2],
+    (with ``num_place`` 7 more, and one for every way-point of the course),
+    ``is_init`` bool [*B, 1], true in the first step of an episode; with assistance ``heading_error`` [*B, 2] too, and
+    with ``num_place`` also ``progress`` [*B, S], of which the first of an episode counts.
+    Keys written: ``depth_feature`` [*B, F], ``terrain_latent`` [*B, 32], ``heading_estimate`` [*B, 2],
     ``obstacle_logits`` [*B, 7], ``(memory, hidden)`` [*B, 512], ``(perceived, heading_error)``,
-    ``(perceived, obstacle)``, with ``num_place`` also ``place_estimate`` [*B, 8] and ``(perceived, place)``,
+    ``(perceived, obstacle)``, with ``num_place`` also ``place_estimate`` [*B, 8], ``progress_logits`` [*B, S] and
+    ``(perceived, place)``,
     ``estimate``, ``latent`` and those of :class:`~agility_rl.modules.HybridActor`.
 
     Args:
@@ -69,9 +71,12 @@ class RecurrentStudent(nn.Module):
         memory: units of the GRU.
         encoder_channels: of the depth encoder's two convolutions.
         encoder_hidden: units of its hidden linear layer.
+        encoder_features: numbers that it makes of an image.
         heading_gate: see :data:`HEADING_GATE`.
         period: of a decision [s]; who infers the place counts what it has gone meanwhile.
         way_points: ``[K][W][2]``, of every type of obstacle in its frame [m]; who infers the place knows them.
+        routes: ``[R][L][3]``, where the obstacles of the course stand (:attr:`agility_rl.envs.Course.legs`); who infers
+            the place knows that too, but for the jitter.
 
     Raises:
         ValueError: if ``num_place`` is another number, or obstacles lack way-points.
@@ -98,9 +103,11 @@ class RecurrentStudent(nn.Module):
         memory: int = 512,
         encoder_channels: tuple[int, int] = (32, 64),
         encoder_hidden: int = 128,
+        encoder_features: int = NUM_FEATURES,
         heading_gate: float = HEADING_GATE,
         period: float = constants.CONTROL_DT,
         way_points: Sequence[Sequence[Sequence[float]]] = (),
+        routes: Sequence[Sequence[Sequence[float]]] = (((0.0, 0.0, 0.0),),),
     ) -> None:
         super().__init__()
         if num_place not in (0, NUM_PLACE):
@@ -117,14 +124,15 @@ class RecurrentStudent(nn.Module):
             "memory": memory,
             "encoder_channels": list(encoder_channels),
             "encoder_hidden": encoder_hidden,
+            "encoder_features": encoder_features,
             "heading_gate": heading_gate,
-            **({"period": period, "way_points": way_points} if num_place else {}),
+            **({"period": period, "way_points": way_points, "routes": routes} if num_place else {}),
         }
-        self.depth_encoder = DepthEncoder(NUM_FEATURES, channels=encoder_channels, hidden=encoder_hidden)
+        self.depth_encoder = DepthEncoder(encoder_features, channels=encoder_channels, hidden=encoder_hidden)
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
-        sizes = (NUM_FEATURES, features.NUM_PROPRIOCEPTION, memory, num_obstacles)
-        self.memory = PlacedMemory(*sizes, period, torch.tensor(way_points)) if num_place else Memory(*sizes)
+        sizes = (encoder_features, features.NUM_PROPRIOCEPTION, memory, num_obstacles)
+        self.memory = PlacedMemory(*sizes, period, torch.tensor(way_points), routes) if num_place else Memory(*sizes)
         self.measured = [keys.PROPRIOCEPTION, *([keys.ESTIMATE] if num_place else [])]
         self.heading_gate = heading_gate
         inputs: dict[NestedKey, int] = {
@@ -161,12 +169,14 @@ class RecurrentStudent(nn.Module):
         """The policy, sharing this student's parameters.
 
         Args:
-            assisted: take heading errors beyond the gate from ``heading_error``, as in training.
+            assisted: take heading errors beyond the gate from ``heading_error``, as in training, and the
+                way-point where an episode starts from ``progress``. Without, episodes start before the first obstacle.
             sequence: for batches ``[T, *B]`` of consecutive steps, time first, instead of one step ``[*B]``; of
                 ``hidden`` only the first step's counts.
             seen: read the images' ``depth_feature`` instead of the images.
         """
-        remember = self.memory if sequence else _OneStep(self.memory)
+        remember = self.memory if sequence else _OneStep(self.memory, 1 + len(self.measured))
+        start = [keys.PROGRESS] if assisted and self.settings["num_place"] else []
         perceive = _Perception(self.heading_gate if assisted else None)
         placed = self.settings["num_place"] > 0
         return TensorDictSequential(
@@ -174,10 +184,10 @@ class RecurrentStudent(nn.Module):
             self.estimator,
             TensorDictModule(
                 remember,
-                in_keys=[keys.DEPTH_FEATURE, *self.measured, keys.HIDDEN, "is_init"],
+                in_keys=[keys.DEPTH_FEATURE, *self.measured, keys.HIDDEN, "is_init", *start],
                 out_keys=[
                     *(keys.TERRAIN_LATENT, keys.HEADING_ESTIMATE, keys.OBSTACLE_LOGITS, NEXT_HIDDEN),
-                    *([keys.PLACE_ESTIMATE] if placed else []),
+                    *([keys.PLACE_ESTIMATE, keys.PROGRESS_LOGITS] if placed else []),
                 ],
             ),
             TensorDictModule(
@@ -237,6 +247,10 @@ class Memory(nn.Module):
             pieces.append(piece)
         return self._infer(torch.cat(pieces).reshape(time, *batch, self.size))
 
+    def begun(self, hidden: Tensor, is_init: Tensor) -> Tensor:
+        """Memory ``[*B, M]``, empty where a bool mask ``[*B, 1]`` says that an episode begins."""
+        return hidden.masked_fill(is_init, 0.0)
+
     def step(self, feature: Tensor, proprioception: Tensor, hidden: Tensor) -> tuple[Tensor, ...]:
         """One step of ``[*B]``, with outputs as :meth:`forward`."""
         fused = self._fuse(feature[None], proprioception[None])
@@ -252,15 +266,19 @@ class Memory(nn.Module):
 
 
 class _OneStep(nn.Module):
-    """A memory for one step of ``[*B]``, that may be an episode's first."""
+    """A memory for one step of ``[*B]``, that may be an episode's first.
 
-    def __init__(self, memory: Memory | PlacedMemory) -> None:
+    It takes feature and measurements, then the memory, whether an episode begins and, if that is told, on which leg.
+    """
+
+    def __init__(self, memory: Memory | PlacedMemory, num_measured: int) -> None:
         super().__init__()
         self.memory: Any = memory
+        self.num_measured = num_measured
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        *measured, hidden, is_init = inputs
-        outputs: tuple[Tensor, ...] = self.memory.step(*measured, hidden.masked_fill(is_init, 0.0))
+        measured, state = inputs[: self.num_measured], inputs[self.num_measured :]
+        outputs: tuple[Tensor, ...] = self.memory.step(*measured, self.memory.begun(*state))
         return outputs
 
 

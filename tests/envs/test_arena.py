@@ -120,6 +120,21 @@ def test_routes_of_other_lengths() -> None:
     assert (arena.progress.leg < arena.layout.length).all()
 
 
+def test_progress_on_routes_that_end_at_the_ramp_and_at_the_tunnel() -> None:
+    """Two routes of two obstacles each: the hurdle and the ramp, the hurdle and the tunnel."""
+    arena, simulator = build("bidirectional")
+    begin(arena, simulator)
+    seen = arena.observe(simulator, rotations.to_euler(simulator.root_quaternion)[2])
+    assert seen[keys.PROGRESS].shape == (N, 16) and (seen[keys.PROGRESS].sum(-1) == 1.0).all()
+    leg = seen[keys.PROGRESS].argmax(-1) // 4
+    assert (seen[keys.PROGRESS].argmax(-1) % 4 == 0).all() and torch.bincount(leg, minlength=4).min() > 2
+    assert torch.equal(leg % 2, arena.progress.leg)
+    goes_to = arena.layout.route[:, 1]  # the second slot or the third
+    assert torch.equal(leg // 2, goes_to - 1)
+    arena.progress.point[:] = 3
+    assert torch.equal(arena.progress.stage, 4 * leg + 3)
+
+
 def test_heading_errors_by_hand() -> None:
     arena, simulator = build("tunnel", n=1)
     begin(arena, simulator)

@@ -19,6 +19,12 @@ def test_a_course_passes_its_slots_in_order_unless_told_otherwise() -> None:
     assert replace(COURSE, routes=((1,), (0, 1))).routes == ((1,), (0, 1))
 
 
+def test_legs_are_the_slots_of_every_route_in_order() -> None:
+    there_and_back = replace(COURSE, routes=((1,), (0, 1)))
+    tunnel, hurdle = (2.0, 7.0, math.pi / 2), (2.0, 3.0, math.pi / 2)
+    assert there_and_back.legs == ((tunnel,), (hurdle, tunnel))
+
+
 def test_what_a_slot_leaves_open_comes_from_its_type() -> None:
     assert HURDLE.heights == (0.05, 0.20) and TUNNEL.heights == (0.0, 0.0)
     assert replace(HURDLE, difficulty=(0.1, 0.3)).heights == (0.1, 0.3)

@@ -64,27 +64,47 @@ def test_values_against_numpy() -> None:
     assert out["accuracy_obstacle"].item() == pytest.approx((obstacle.argmax(-1) == kind).mean())
 
 
-def test_place_against_numpy() -> None:
-    class Placed(Heads):
+def with_another_head(size: int, key: str) -> TensorDictModule:
+    class Wider(Heads):
         def __init__(self) -> None:
             super().__init__()
-            self.place = nn.Linear(5, 8)
+            self.another = nn.Linear(5, size)
 
         def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            return (*super().forward(x), self.place(x))
+            return (*super().forward(x), self.another(x))
 
-    written = ["logits", "loc", "heading_estimate", "obstacle_logits", "place_estimate"]
-    net, td = TensorDictModule(Placed(), in_keys=["x"], out_keys=written), batch()
+    written = ["logits", "loc", "heading_estimate", "obstacle_logits", key]
+    return TensorDictModule(Wider(), in_keys=["x"], out_keys=written)
+
+
+def test_progress_against_numpy() -> None:
+    net, td = with_another_head(6, "progress_logits"), batch()
+    leg = torch.tensor([0, 5, 3, 3, 1, 2])
+    td["progress"] = torch.eye(6)[leg]
+    loss = StudentLoss(net, progress=0.5)
+    assert "progress" in loss.in_keys and "progress" not in StudentLoss(net).in_keys
+    out = loss(td)
+    logits = net.module.another(td["x"]).detach().numpy()
+    surprise = np.log(np.exp(logits).sum(1)) - logits[np.arange(6), leg.numpy()]
+    assert out["loss_progress"].item() == pytest.approx(0.5 * surprise.mean(), rel=1e-5)
+    assert out["accuracy_progress"].item() == pytest.approx((logits.argmax(-1) == leg.numpy()).mean())
+    assert set(out.keys()) == set(loss.out_keys)
+    out["loss_progress"].backward()
+    assert net.module.another.weight.grad.abs().sum() > 0 and net.module.logits.weight.grad is None
+
+
+def test_place_against_numpy() -> None:
+    net, td = with_another_head(8, "place_estimate"), batch()
     td["place"] = torch.randn(6, 8)
     loss = StudentLoss(net, place=0.25)
     assert "place" in loss.in_keys and "place" not in StudentLoss(net).in_keys
     out = loss(td)
-    distance = np.abs(td["place"].numpy() - net.module.place(td["x"]).detach().numpy())
+    distance = np.abs(td["place"].numpy() - net.module.another(td["x"]).detach().numpy())
     assert out["loss_place"].item() == pytest.approx(0.25 * distance.sum(1).mean(), rel=1e-5)
     assert out["error_place"].item() == pytest.approx(distance[:, :2].mean(), rel=1e-5)
     assert set(out.keys()) == set(loss.out_keys)
     out["loss_place"].backward()
-    assert net.module.place.weight.grad.abs().sum() > 0 and net.module.logits.weight.grad is None
+    assert net.module.another.weight.grad.abs().sum() > 0 and net.module.logits.weight.grad is None
 
 
 def test_latent_against_numpy() -> None:

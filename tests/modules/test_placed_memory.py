@@ -5,8 +5,10 @@ import math
 import pytest
 import torch
 
+from agility_rl.envs.course_presets import COURSES
 from agility_rl.go2 import features
-from agility_rl.modules.placed_memory import PlacedMemory, bearings, chosen, moved, planar_motion, seen_from
+from agility_rl.modules.placed_memory import ALIKE, DRIFT, NEXT, START, PlacedMemory
+from agility_rl.modules.planar import bearings, inverted, moved, planar_motion, seen_from, within
 from agility_rl.rotations import from_euler, rotate
 
 POINTS = torch.tensor([-1.5, -0.5, 0.5, 1.5])[:, None] * torch.tensor([1.0, 0.0]).expand(7, 1, 2)
@@ -18,20 +20,21 @@ def place_of(position: torch.Tensor, yaw: torch.Tensor, points: torch.Tensor) ->
     return torch.cat((torch.view_as_real(offset).flatten(), position, yaw.sin()[None], yaw.cos()[None]))
 
 
-def test_moved_is_what_another_place_sees() -> None:
-    points, position, yaw = torch.tensor([[2.0, 1.0], [-1.0, 3.0]]), torch.tensor([0.4, -0.7]), torch.tensor(0.8)
-    motion = torch.tensor([0.5, -0.2, 0.6])
+def test_moved_against_complex_numbers() -> None:
+    position, yaw, motion = torch.tensor([0.4, -0.7]), torch.tensor(0.8), torch.tensor([0.5, -0.2, 0.6])
     step = torch.polar(torch.tensor(1.0), yaw) * torch.complex(motion[0], motion[1])
-    expected = place_of(position + torch.view_as_real(step), yaw + motion[2], points)
-    torch.testing.assert_close(moved(place_of(position, yaw, points), motion), expected)
+    there, turned = position + torch.view_as_real(step), yaw + motion[2]
+    expected = torch.cat((there, turned.sin()[None], turned.cos()[None]))
+    pose = torch.cat((position, yaw.sin()[None], yaw.cos()[None]))
+    torch.testing.assert_close(moved(pose, motion), expected)
 
 
 def test_there_and_back_again() -> None:
-    place = torch.randn(5, 8)
+    pose = torch.randn(5, 4)
     turn, way = torch.tensor([0.0, 0.0, 0.9]), torch.tensor([0.3, 0.1, 0.0])
-    back = moved(moved(moved(place, way), turn), -turn)
-    torch.testing.assert_close(moved(back, -way), place)
-    assert not torch.allclose(back, place)
+    back = moved(moved(moved(pose, way), turn), -turn)
+    torch.testing.assert_close(moved(back, -way), pose)
+    assert not torch.allclose(back, pose)
 
 
 @pytest.mark.parametrize("angles", [(0.0, 0.0), (0.3, 0.0), (0.0, -0.4), (0.2, 0.5)])
@@ -54,76 +57,228 @@ def test_planar_motion_against_quaternions(angles: tuple[float, float]) -> None:
     torch.testing.assert_close(found[2], yaw_rate)
 
 
-def test_without_gains_it_only_counts_its_way() -> None:
-    """Half a turn to the left at 1 m/s in 5 s: a circle whose radius is 5 / pi."""
-    memory = PlacedMemory(32, 45, 8, 7, 0.05, POINTS)
+FIRST, STRAIGHT, BACK = (2.0, 3.0, 0.0), (6.0, 3.0, 0.0), (6.0, 5.0, math.pi)
+"""Three obstacles in the arena: the second is 4 m ahead of the first, the third 2 m beside it, facing the other way."""
+
+
+def silent(*routes: tuple[tuple[float, float, float], ...]) -> tuple[PlacedMemory, dict[str, torch.Tensor]]:
+    """A memory whose head and glance say what their biases say, and views of those by name; nothing counts."""
+    memory = PlacedMemory(32, 45, 8, 7, 0.05, POINTS.clone(), routes or (((0.0, 0.0, 0.0),),))
     with torch.no_grad():
-        memory.head[0].weight.zero_()
-        memory.head[0].bias[-19:-10] = -100.0
+        for layer in (memory.head[0], memory.glance.linear[0]):
+            layer.weight.zero_()
+            layer.bias.zero_()
+    head = memory.head[0].bias.detach().split((*memory.known, 3, 1))
+    biases = dict(zip(("latent", "obstacle", "progress", "alike", "weight"), head, strict=True))
+    biases["correction"], biases["scale"] = memory.glance.correction[-1].bias.detach().split((4, 3))
+    biases["alike"].fill_(100.0)
+    biases["weight"].fill_(-100.0)
+    return memory, biases
+
+
+def still(memory: PlacedMemory, pose: list[float], at: int | None = None) -> tuple[torch.Tensor, ...]:
+    """Inputs of a step in which nothing moves: a pose in the arena, and a way-point that is certain."""
+    belief = torch.zeros(memory.parts[-1])
+    if at is not None:
+        belief = belief - 30.0
+        belief[at] = 0.0
+    before = torch.cat((torch.tensor(pose) - memory.starts[0], torch.zeros(3), belief - memory.prior))
+    return torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4), torch.cat((torch.zeros(8), before))[None]
+
+
+@torch.no_grad()
+def test_who_sees_nothing_only_counts_the_way() -> None:
+    """Half a turn to the left at 1 m/s in 5 s: a circle whose radius is 5 / pi."""
+    memory, _ = silent()
     steps = 100
     proprioception, estimate = torch.zeros(steps, 1, 45), torch.zeros(steps, 1, 4)
     proprioception[..., 4] = math.pi / 5.0 * features.ANGULAR_VELOCITY_SCALE
     estimate[..., 1] = 1.0 * features.LINEAR_VELOCITY_SCALE
-    hidden = torch.zeros(1, 16)
-    hidden[0, 8:] = torch.tensor([4.0, 0.0, 0.0, 4.0, -1.0, 0.0, 0.0, 1.0])
+    begun = torch.tensor([-9.0, 0.0, 0.0, 1.0])
+    hidden = still(memory, begun.tolist())[-1]
     first = torch.zeros(steps, 1, 1, dtype=torch.bool)
-    with torch.no_grad():
-        *_, after, place = memory(torch.zeros(steps, 1, 32), proprioception, estimate, hidden[None], first)
-    wide = 10.0 / math.pi
-    expected = torch.tensor([-4.0, wide, 0.0, wide - 4.0, -1.0, wide, 0.0, -1.0])
-    torch.testing.assert_close(after[-1, 0, 8:], expected, atol=0.06, rtol=0.0)  # half a step short of the end
-    torch.testing.assert_close(place[0, 0], moved(hidden[0, 8:], torch.tensor([0.025, 0.0, math.pi / 200.0])))
+    *_, after, place, _ = memory(torch.zeros(steps, 1, 32), proprioception, estimate, hidden[None], first)
+    expected = torch.tensor([-9.0, 10.0 / math.pi, 0.0, -1.0])
+    torch.testing.assert_close(after[-1, 0, 8:12] + memory.starts[0], expected, atol=0.06, rtol=0.0)
+    torch.testing.assert_close(place[0, 0, 4:], moved(begun, torch.tensor([0.025, 0.0, math.pi / 200.0])))
 
 
-def test_a_switch_puts_the_next_way_point_first_and_a_gain_believes_what_is_said() -> None:
-    memory = PlacedMemory(32, 45, 8, 7, 0.04, POINTS)
-    inputs = (torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4))
-    hidden = torch.arange(16.0)[None]
-    with torch.no_grad():
-        memory.head[0].weight.zero_()
-        memory.head[0].bias[-19:-11] = -100.0
-        memory.head[0].bias[-11] = 100.0
-        switched = memory.step(*inputs, hidden)[-1]
-        memory.head[0].bias[-19:-11] = 100.0
-        memory.head[0].bias[-27:-19] = 2.0 * torch.arange(8.0)
-        memory.head[0].bias[[-6, -1]] = 100.0
-        said = memory.step(*inputs, hidden)[-1]
-    torch.testing.assert_close(switched[0], torch.tensor([10.0, 11.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0]))
-    torch.testing.assert_close(said[0], 2.0 * torch.arange(8.0))
+@torch.no_grad()
+def test_a_place_is_corrected_by_as_much_as_it_is_unsure_and_credible() -> None:
+    """Images that count one each, and are off by 0.1 m, 0.2 m and 0.05 on average; an episode has just begun.
+
+    The robot stands 1 m before the obstacle and 0.1 m to its left, which is said to be nearer, and turned; or 4 m away.
+    """
+    memory, bias = silent()
+    bias["alike"].fill_(-ALIKE)
+    bias["scale"].copy_(torch.tensor([0.1, 0.2, 0.05]).log())
+    variance = torch.tensor(START) + 0.05 * torch.tensor(DRIFT)
+    gain = variance / (variance + 2.0 * torch.tensor([0.1, 0.2, 0.05]) ** 2)
+    for closer in (0.5, -4.0):
+        bias["correction"].copy_(torch.tensor([-closer, 0.0, 0.0, 0.0]))
+        *_, after, place, _ = memory.step(*still(memory, [-1.0, 0.1, 0.0, 1.0], 1))
+        share = gain / (1.0 + closer**4)
+        expected = torch.tensor([-1.0 + share[0].item() * closer, 0.1, 0.0, 1.0])
+        torch.testing.assert_close(place[0, 4:], expected)
+        torch.testing.assert_close(after[0, 12:15] + torch.tensor(START), (1.0 - share) * variance)
+
+
+@torch.no_grad()
+def test_who_turns_does_so_about_the_obstacle() -> None:
+    """An obstacle 1 m ahead is said to be turned by 0.5: it stays ahead, so the robot stands elsewhere at it."""
+    memory, bias = silent()
+    bias["alike"].fill_(-200.0)
+    bias["correction"].copy_(torch.tensor([0.0, 0.0, math.sin(0.5), math.cos(0.5) - 1.0]))
+    *_, place, _ = memory.step(*still(memory, [-1.0, 0.0, 0.0, 1.0], 1))
+    expected = torch.tensor([-math.cos(0.5), math.sin(0.5), -math.sin(0.5), math.cos(0.5)])
+    torch.testing.assert_close(place[0, 4:], expected)
+
+
+@torch.no_grad()
+def test_many_images_are_as_good_as_their_mean_and_no_better_than_alike() -> None:
+    """100 images, of which 10 count as one, leave the variance of a mean of ten, and of what was known before."""
+    memory, bias = silent()
+    memory.drift.zero_()
+    bias["alike"].fill_(math.log(10.0) - ALIKE)
+    bias["scale"].fill_(math.log(0.3))
+    inputs = still(memory, [-1.5, 0.0, 0.0, 1.0], 1)
+    state = inputs[-1]
+    for _ in range(100):
+        state = memory.step(*inputs[:3], state)[3]
+    expected = 1.0 / (1.0 / torch.tensor(START) + 10.0 / (2.0 * 0.3**2))
+    torch.testing.assert_close(state[0, 12:15] + torch.tensor(START), expected, rtol=1e-3, atol=0.0)
+
+
+@torch.no_grad()
+def test_the_next_obstacle_may_stand_elsewhere() -> None:
+    """What is known of the place at one obstacle is known of that at the next but for the jitter of both."""
+    memory, _ = silent((FIRST, STRAIGHT))
+    *_, after, _, _ = memory.step(*still(memory, [3.5, 3.1, 0.0, 1.0], 3))
+    added = torch.tensor(NEXT) + 0.05 * torch.tensor(DRIFT)
+    torch.testing.assert_close(after[0, 12:15], added)
+
+
+def test_what_is_seen_from_where_it_sees_from() -> None:
+    """The origin in the frame of a pose is the pose in the frame of the origin, inverted: twice is not at all."""
+    pose = torch.cat((torch.randn(5, 2), torch.nn.functional.normalize(torch.randn(5, 2), dim=-1)), -1)
+    there = inverted(pose)
+    torch.testing.assert_close(there[:, :2], seen_from(pose, torch.zeros(1, 2))[:, 0])
+    torch.testing.assert_close(inverted(there), pose)
+
+
+def test_a_pose_within_a_frame() -> None:
+    """1.3 m along and 0.2 m beside, turned by 0.4: the same by complex numbers."""
+    position, yaw = torch.tensor([1.3, 0.2]), torch.tensor(0.4)
+    pose = torch.cat((position, yaw.sin()[None], yaw.cos()[None]))
+    x, y, turn = frame = (0.5, 2.0, 2.5)
+    there = complex(1.3 - x, 0.2 - y) * complex(math.cos(turn), -math.sin(turn))
+    expected = torch.tensor([there.real, there.imag, math.sin(0.4 - turn), math.cos(0.4 - turn)])
+    torch.testing.assert_close(within(pose, torch.tensor([frame]))[0], expected)
+
+
+@torch.no_grad()
+def test_who_reaches_the_last_way_point_stands_before_the_next_obstacle() -> None:
+    """1.5 m behind an obstacle's middle; behind the second, the third is to the left and faces the other way.
+
+    The third is the last: nothing follows it. The pose in the arena stays what it was.
+    """
+    memory, _ = silent((FIRST, STRAIGHT, BACK))
+    for at, pose, follows, expected in (
+        (3, [3.5, 3.1, 0.0, 1.0], 4, [-2.5, 0.1, 0.0, 1.0]),
+        (7, [7.5, 3.1, 0.0, 1.0], 8, [-1.5, 1.9, 0.0, -1.0]),
+        (11, [4.5, 4.9, 0.0, -1.0], 11, [1.5, 0.1, 0.0, 1.0]),
+    ):
+        inputs = still(memory, pose, at)
+        *_, after, place, progress = memory.step(*inputs)
+        torch.testing.assert_close(place[0, 4:], torch.tensor(expected), atol=1e-5, rtol=0.0)
+        torch.testing.assert_close(after[0, 8:12], inputs[-1][0, 8:12], atol=1e-5, rtol=0.0)
+        assert progress.exp()[0, follows] > 0.99
+        torch.testing.assert_close(progress.exp().sum(), torch.tensor(1.0))
+        *_, twice = memory.step(*inputs[:3], after)
+        assert int(twice.argmax()) == follows, "who has left an obstacle does not leave the next one too"
+
+
+@torch.no_grad()
+def test_a_way_point_counts_until_it_is_reached() -> None:
+    """The second way-point is at x = -0.5, and only where it is the present one is it passed."""
+    memory, _ = silent((FIRST, STRAIGHT))
+    for x, y, done in ((-1.5, 0.0, 0.0), (-0.88, 0.0, 0.5), (-0.8, 0.4, 0.0), (-0.5, 0.1, 1.0), (-0.2, 0.4, 1.0)):
+        *_, progress = memory.step(*still(memory, [2.0 + x, 3.0 + y, 0.0, 1.0], 1))
+        assert float(progress.exp()[0, 2]) == pytest.approx(done, abs=0.02)
+        assert float(progress.exp()[0, 1]) == pytest.approx(1.0 - done, abs=0.02)
+
+
+@torch.no_grad()
+def test_evidence_multiplies_the_belief() -> None:
+    """Two way-points, believed in 3 : 1; evidence of log 6 for the second, of which half counts: 3 : sqrt 6."""
+    memory, bias = silent((FIRST,))
+    bias["progress"][:2] = torch.tensor([0.0, math.log(6.0)])
+    bias["weight"].fill_(4.0)
+    *inputs, hidden = still(memory, [-9.0, 0.0, 0.0, 1.0], 1)
+    hidden[0, -4] = math.log(3.0) - memory.prior[0]
+    *_, progress = memory.step(*inputs, hidden)
+    assert float((progress[0, 0] - progress[0, 1]).exp()) == pytest.approx(3.0 / math.sqrt(6.0), rel=1e-2)
+
+
+@torch.no_grad()
+def test_evidence_moves_the_belief_to_a_neighbour() -> None:
+    """Evidence of 4, three times: from a doubt of 1e-3 that is enough, for two way-points further on it is not."""
+    for spoken, follows in ((1, 1), (3, 0)):
+        memory, bias = silent((FIRST, STRAIGHT))
+        bias["progress"][spoken] = 4.0
+        bias["weight"].fill_(100.0)
+        *inputs, state = still(memory, [-9.0, 0.0, 0.0, 1.0], 0)
+        for _ in range(3):
+            *_, state, _, progress = memory.step(*inputs, state)
+        torch.testing.assert_close(progress.exp().sum(), torch.tensor(1.0))
+        assert int(progress.argmax()) == follows
+
+
+@torch.no_grad()
+def test_an_episode_begins_before_the_first_obstacle_unless_told_otherwise() -> None:
+    memory, _ = silent((FIRST, STRAIGHT, BACK))
+    hidden, first = torch.randn(2, memory.size), torch.tensor([[True], [False]])
+    for start, leg in ((None, 0), (torch.eye(12)[[8, 0]], 2)):
+        begun = memory.begun(hidden, first, start)
+        assert torch.equal(begun[1], hidden[1])
+        *_, place, progress = memory.step(torch.zeros(2, 32), torch.zeros(2, 45), torch.zeros(2, 4), begun)
+        torch.testing.assert_close(place[0, 4:], torch.tensor([-1.5, 0.0, 0.0, 1.0]), atol=1e-6, rtol=0.0)
+        assert float(progress[0].exp().unflatten(0, (3, 4)).sum(-1)[leg]) > 0.99
+
+
+def test_routes_do_not_mix() -> None:
+    """The hurdle, then the ramp or the tunnel: who is on the first route stays on it."""
+    memory = PlacedMemory(32, 45, 8, 7, 0.04, POINTS, COURSES["bidirectional"].legs)
+    assert memory.parts == (8, 4, 3, 16) and memory.prior.nonzero()[:, 0].tolist() == [0, 8]
+    assert memory.following.tolist() == [1, 2, 3, 4, 5, 6, 7, 7, 9, 10, 11, 12, 13, 14, 15, 15]
 
 
 def test_way_points_of_an_obstacle_lie_where_its_place_says() -> None:
-    """Turned by 0.8 at (0.4, -0.7): the same as by complex numbers; shares mix them with what was said."""
+    """Turned by 0.8 at (0.4, -0.7): the same as by complex numbers."""
     points, position, yaw = torch.tensor([[2.0, 1.0], [-1.0, 3.0]]), torch.tensor([0.4, -0.7]), torch.tensor(0.8)
     place = place_of(position, yaw, points)
-    candidates = seen_from(place[4:], points)
-    torch.testing.assert_close(candidates.flatten(), place[:4])
-    shares = torch.tensor([[1.0, 2.0, 1.0], [0.0, 1.0, 3.0]])
-    found = chosen(shares.log().flatten(), candidates, torch.full((4,), 5.0)).unflatten(0, (2, 2))
-    torch.testing.assert_close(found[0], 0.25 * candidates[0] + 0.5 * candidates[1] + 0.25 * 5.0)
-    torch.testing.assert_close(found[1], 0.25 * candidates[1] + 0.75 * 5.0)
+    torch.testing.assert_close(seen_from(place[4:], points).flatten(), place[:4])
 
 
-def test_way_points_are_those_of_the_likeliest_obstacle() -> None:
-    points = POINTS.clone()
-    points[3] += 1.0
-    memory = PlacedMemory(32, 45, 8, 7, 0.04, points)
-    with torch.no_grad():
-        memory.head[0].weight.zero_()
-        memory.head[0].bias[32 + 3] = 9.0  # its type
-        memory.head[0].bias[-19:-11] = 100.0  # believed is what was said of the place at the obstacle,
-        memory.head[0].bias[-27:-19] = torch.tensor([9.0, 9.0, 9.0, 9.0, -2.0, 0.0, 0.0, 1.0])
-        memory.head[0].bias[[-10, -4]] = 100.0  # and the first and second way-point of it
-        place = memory.step(torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4), torch.zeros(1, 16))[-1]
-    torch.testing.assert_close(place[0], torch.tensor([1.5, 1.0, 2.5, 1.0, -2.0, 0.0, 0.0, 1.0]))
+@torch.no_grad()
+def test_way_points_are_those_of_the_likeliest_obstacle_and_then_where_the_next_is_entered() -> None:
+    """At (0, 0.5), looking along the first obstacle of two; of its type all way-points lie 1 m further and aside."""
+    memory, bias = silent((FIRST, STRAIGHT))
+    memory.way_points[3] += 1.0
+    bias["obstacle"][3] = 20.0
+    # The entry is the mean over the types: at -1.5 in the frame of the second obstacle, which is 4 m on.
+    for at, expected in ((0, [-0.5, 0.5, 0.5, 0.5]), (3, [2.5, 0.5, 2.5, -0.5]), (7, [6.5, 0.5, 6.5, 0.5])):
+        *_, place, _ = memory.step(*still(memory, [2.0, 3.5, 0.0, 1.0], at))
+        torch.testing.assert_close(place[0, :4], torch.tensor(expected), atol=1e-5, rtol=0.0)
 
 
 def test_gradients_reach_what_was_said_earlier() -> None:
     memory = PlacedMemory(32, 45, 8, 7, 0.04, POINTS)
+    torch.nn.init.normal_(memory.glance.correction[-1].weight)
     feature = torch.randn(6, 2, 32, requires_grad=True)
     first = torch.zeros(6, 2, 1, dtype=torch.bool)
     first[3, 0] = True
-    *_, place = memory(feature, torch.randn(6, 2, 45), torch.randn(6, 2, 4), torch.randn(1, 2, 16), first)
+    *_, place, _ = memory(feature, torch.randn(6, 2, 45), torch.randn(6, 2, 4), torch.randn(1, 2, memory.size), first)
     place[5].sum().backward()
     assert (feature.grad[3:].abs().sum(-1) > 0).all() and (feature.grad[:3, 1].abs().sum(-1) > 0).all()
     assert (feature.grad[:3, 0] == 0).all(), "an episode does not remember the one before it"

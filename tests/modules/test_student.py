@@ -30,6 +30,7 @@ def steps(time: int, robots: int, size: int = M) -> TensorDict:
             "proprioception": torch.randn(time, robots, 45),
             "history": torch.randn(time, robots, 10, 45),
             "heading_error": torch.rand(time, robots, 2) * 2.0 - 1.0,
+            "progress": torch.eye(4)[torch.zeros(time, robots, dtype=torch.long)],
             "hidden": torch.randn(robots, size).expand(time, robots, size),
             "is_init": torch.zeros(time, robots, 1, dtype=torch.bool),
         },
@@ -53,15 +54,16 @@ def test_sizes_are_those_of_the_supplement() -> None:
     assert student.memory.fusion[0].in_features == 32 + 45
     assert student.memory.head[0].out_features == 32 + 2 + 7
     placed = RecurrentStudent(num_place=8, way_points=WAY_POINTS).memory
-    assert (placed.cell.input_size, placed.cell.hidden_size, placed.size) == (32, 512, 520)
-    assert placed.head[0].out_features == 32 + 7 + 8 + 9 + 2 * 5
+    assert (placed.cell.input_size, placed.cell.hidden_size, placed.size) == (32, 512, 523)
+    assert placed.head[0].out_features == 32 + 7 + 4 + 3 + 1
 
 
 def test_a_smaller_encoder_is_built_again_from_its_settings() -> None:
-    small = RecurrentStudent(memory=M, encoder_channels=(4, 3), encoder_hidden=5)
+    small = RecurrentStudent(memory=M, encoder_channels=(4, 3), encoder_hidden=5, encoder_features=9)
     first, _, _, second, _ = small.depth_encoder.module.convolutions
     assert (first.out_channels, second.out_channels) == (4, 3)
     assert small.depth_encoder.module.linear[1].weight.shape == (5, 3 * 25 * 39)  # 58 x 87, kernel 5, pool 2, kernel 3
+    assert small.policy()(steps(1, 3)[0])["depth_feature"].shape == (3, 9)
     again = RecurrentStudent(**small.settings)
     again.load_state_dict(small.state_dict())
     with pytest.raises(RuntimeError, match="size mismatch"):
@@ -162,7 +164,7 @@ def test_from_a_teacher_that_reads_its_place() -> None:
     teacher = Teacher(hidden=(32, 16), num_place=8)
     student = RecurrentStudent.from_teacher(teacher, memory=M, way_points=WAY_POINTS)
     assert student.settings["num_place"] == 8 and "place" not in student.policy(assisted=True).in_keys
-    td = steps(1, 3, M + 8)[0].update({"obstacle": torch.eye(7)[:3], "scandots": torch.randn(3, 132)})
+    td = steps(1, 3, student.memory.size)[0].update({"obstacle": torch.eye(7)[:3], "scandots": torch.randn(3, 132)})
     seen = student.policy()(td.clone())
     assert torch.equal(seen["perceived", "place"], seen["place_estimate"]) and seen["place_estimate"].shape == (3, 8)
     with set_interaction_type(InteractionType.DETERMINISTIC):
@@ -183,12 +185,19 @@ def test_who_infers_a_place_knows_the_obstacles() -> None:
 
 
 def test_imitation_does_not_push_the_place() -> None:
-    student = RecurrentStudent(memory=M, num_place=8, way_points=WAY_POINTS)
-    td = student.policy(sequence=True)(steps(3, 2, M + 8))
+    student = RecurrentStudent(
+        memory=M, num_place=8, way_points=WAY_POINTS, routes=[[[2.0, 3.0, 1.5], [2.0, 7.0, 1.5]]]
+    )
+    torch.nn.init.normal_(student.memory.glance.correction[-1].weight)
+    td = student.policy(sequence=True)(steps(3, 2, M + 15))
     td["loc"].sum().backward(retain_graph=True)
     assert student.memory.head[0].weight.grad[32:].abs().sum() == 0
-    td["place_estimate"].sum().backward()
-    assert (student.memory.head[0].weight.grad[-27:].abs().sum(1) > 0).all()
+    td["place_estimate"].sum().backward(retain_graph=True)
+    pushed = (student.memory.head[0].weight.grad[39:].abs().sum(1) > 0).tolist()
+    # How many images count as one; the likeliest way-point is no matter of degree.
+    assert pushed == [False] * 8 + [True] * 3 + [False]
+    td["progress_logits"][..., 0].sum().backward()
+    assert (student.memory.head[0].weight.grad[39:].abs().sum(1) > 0).all()
     assert not td["heading_estimate"].requires_grad
 
 

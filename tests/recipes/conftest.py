@@ -16,6 +16,7 @@ import torch
 
 from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.deploy.task import describe_camera
+from agility_rl.envs.course_presets import COURSES
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import features
 from agility_rl.modules import BasicBehaviourController, RecurrentStudent, Teacher
@@ -51,8 +52,11 @@ def make_student(untrained_teacher: Path, tmp_path: Path, module: Callable[[str]
         torch.manual_seed(seed)
         teacher = Artifact.load(untrained_teacher / "policy")
         points = [[list(point) for point in kind.way_points] for kind in OBSTACLES.values()]
-        sizes = {"memory": 16, "encoder_channels": (4, 8), "encoder_hidden": 8, "heading_gate": 4.0}
-        network = RecurrentStudent(**teacher.manifest["network"], **sizes, way_points=points)
+        sizes = {"memory": 16, "encoder_channels": (4, 8), "encoder_hidden": 8, "encoder_features": 8}
+        sizes |= {"heading_gate": 4.0}
+        network = RecurrentStudent(
+            **teacher.manifest["network"], **sizes, way_points=points, routes=COURSES["bar_jump"].legs
+        )
         camera = describe_camera()
         camera["training"] = {"frame_steps": 1, "latency": [1, 1], "pitch": 0.09, "offset_noise": 0.05}
         manifest = build_manifest("student", features.CONTROLLER_LAYOUTS, control_period=0.04)

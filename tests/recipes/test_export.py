@@ -102,22 +102,23 @@ def test_a_student_is_exported_with_its_memory(
     assert export.main(export.Config(run, bbc=untrained, output=output, steps=12)) == output
     artifact = Artifact.load(output, kind="student")
     entry = artifact.manifest["onnx"]
-    assert entry["checked_on"] == "48 recorded inputs" and entry["largest_difference"] <= 1e-5
+    # The logarithm of a belief moves by 50 for each metre, of which float32 rounds 4 to 2.4e-7 at every step.
+    assert entry["checked_on"] == "48 recorded inputs" and entry["largest_difference"] <= export.SAME_DECISION
     assert entry["inputs"] == {
         "depth": [1, 58, 87],
         "proprioception": [1, 45],
         "history": [1, 10, 45],
-        "hidden": [1, 24],
+        "hidden": [1, 27],
     }
     assert artifact.manifest["camera"] == Artifact.load(run).manifest["camera"]
     generator = torch.Generator().manual_seed(7)
     networks = torch_student(artifact), onnx_student(artifact)
-    memories = [torch.zeros(1, 24), torch.zeros(1, 24)]
+    memories = [torch.zeros(1, 27), torch.zeros(1, 27)]
     for _ in range(20):  # the memory does not drift apart
         depth = torch.rand(1, 58, 87, generator=generator) - 0.5
         rest = [torch.randn(1, *shape, generator=generator) for shape in ((45,), (10, 45))]
         answers = [net(depth, *rest, memory) for net, memory in zip(networks, memories, strict=True)]
-        assert export.difference(*answers) <= 1e-5
+        assert export.difference(*answers) <= export.SAME_DECISION
         memories = [answer[-1] for answer in answers]
     with pytest.raises(ArtifactError, match="no ONNX file beside the manifest"):
         onnx_student(Artifact.load(run))

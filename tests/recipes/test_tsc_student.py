@@ -19,6 +19,7 @@ from agility_rl.deploy.artifact import Artifact
 from agility_rl.deploy.task import describe_camera
 from agility_rl.go2 import camera
 from agility_rl.modules import RecurrentStudent
+from agility_rl.modules.planar import inverted, moved
 from agility_rl.record.mcap_logger import read_scalars
 
 Module = Callable[[str], ModuleType]
@@ -150,9 +151,34 @@ def test_glances_of_the_same_images_lower_their_errors(recipe: ModuleType, modul
     parts = setup.build(*setup.resolve(cfg))
     window, glances = parts.collector.collect(), module("glances")
     parts.glances.images.extend(glances.asked(window, glances.known_terrain(parts.teacher, window)).flatten())
-    first, last = (parts.glances.learn(20, 0) for _ in range(2))
-    for name in ("error_latent", "loss_obstacle", "error_place"):
+    first, _, last = (parts.glances.learn(steps, 0) for steps in (20, 100, 20))
+    for name in ("error_latent", "loss_obstacle"):
         assert last[f"glance/{name}"] < 0.8 * first[f"glance/{name}"], name
+    assert last["glance/loss_place"] < first["glance/loss_place"] - 0.05  # a logarithm, by scales of some 0.2
+    parts.env.close()
+
+
+def test_a_glance_knows_how_sure_it_is(recipe: ModuleType, module: Module, smoke: Any) -> None:
+    """The loss of the place is Laplace's negative log-likelihood, but for the logarithm of 2, times the scale.
+
+    Who corrects by a constant is as far off as what was expected is, and that constant.
+    """
+    setup, glances = module("tsc_student_setup"), module("glances")
+    parts = setup.build(*setup.resolve(replace(smoke, precision="float32")))
+    correction, scale = torch.tensor([0.1, -0.2, 0.0, 0.05]), torch.tensor([0.4, 0.3, 0.15])
+    with torch.no_grad():
+        parts.glances.head.correction[-1].bias.copy_(torch.cat((correction, scale.log())))
+    window = parts.collector.collect()
+    sample = glances.asked(window, glances.known_terrain(parts.teacher, window)).flatten()
+    before = parts.glances.generator.get_state()
+    found = dict(zip(glances.ERRORS, parts.glances.errors(sample, window["depth"].flatten(0, 1).float()), strict=True))
+    noise = torch.randn(len(sample), 3, generator=parts.glances.generator.set_state(before))
+    truth = inverted(sample["place"][:, 4:])
+    said = moved(truth, noise * torch.tensor([0.5, 0.5, 0.2])) + correction
+    scale = torch.cat((scale, scale[2:]))
+    density = torch.distributions.Laplace(said, scale).log_prob(truth) + math.log(2.0)
+    torch.testing.assert_close(found["loss_place"], -(scale * density).mean())
+    torch.testing.assert_close(found["error_place"], (truth - said).abs().mean())
     parts.env.close()
 
 
@@ -165,7 +191,7 @@ def test_imitation_of_one_window_lowers_its_loss(recipe: ModuleType, module: Mod
     losses = [recipe.imitate(parts, cfg, window, 0) for _ in range(30)]
     first, last = losses[0], losses[-1]
     assert parts.representation is None
-    for name in ("loss_behaviour", "loss_parameters", "loss_heading", "loss_obstacle", "loss_place"):
+    for name in ("loss_behaviour", "loss_parameters", "loss_obstacle"):
         assert last[name] < 0.75 * first[name], name
     parts.env.close()
 
