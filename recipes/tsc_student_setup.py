@@ -208,7 +208,8 @@ def make_augmentation(cfg: AugmentationConfig, generator: torch.Generator) -> De
 def make_representation(cfg: Config, student: RecurrentStudent) -> Representation:
     """BYOL around the encoder of a student."""
     own = cfg.representation
-    byol = BYOL(student.depth_encoder, hidden=own.hidden, out_features=own.out_features)
+    features = student.settings["encoder_features"]
+    byol = BYOL(student.depth_encoder, features, hidden=own.hidden, out_features=own.out_features)
     loss = BYOLLoss(byol.to(next(student.parameters()).device))
     parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
     return Representation(loss, SoftUpdate(loss, eps=own.decay), torch.optim.Adam(parameters, lr=own.learning_rate))

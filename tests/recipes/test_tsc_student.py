@@ -185,7 +185,7 @@ def test_a_glance_knows_how_sure_it_is(recipe: ModuleType, module: Module, smoke
 def test_imitation_of_one_window_lowers_its_loss(recipe: ModuleType, module: Module, smoke: Any) -> None:
     setup = module("tsc_student_setup")
     own = replace(smoke.imitation, minibatches=1, latent=None, augment=False, learning_rate=3e-3)
-    cfg = replace(smoke, byol=False, memory=64, precision="float32", imitation=own)
+    cfg = replace(smoke, byol=False, memory=64, encoder_features=32, precision="float32", imitation=own)
     parts = setup.build(*setup.resolve(cfg))
     window = parts.collector.collect()
     losses = [recipe.imitate(parts, cfg, window, 0) for _ in range(30)]
