@@ -102,8 +102,7 @@ def test_a_student_is_exported_with_its_memory(
     assert export.main(export.Config(run, bbc=untrained, output=output, steps=12)) == output
     artifact = Artifact.load(output, kind="student")
     entry = artifact.manifest["onnx"]
-    # The logarithm of a belief moves by 50 for each metre, of which float32 rounds 4 to 2.4e-7 at every step.
-    assert entry["checked_on"] == "48 recorded inputs" and entry["largest_difference"] <= export.SAME_DECISION
+    assert entry["checked_on"] == "48 recorded inputs" and entry["largest_difference"] <= 1e-5
     assert entry["inputs"] == {
         "depth": [1, 58, 87],
         "proprioception": [1, 45],
@@ -118,7 +117,10 @@ def test_a_student_is_exported_with_its_memory(
         depth = torch.rand(1, 58, 87, generator=generator) - 0.5
         rest = [torch.randn(1, *shape, generator=generator) for shape in ((45,), (10, 45))]
         answers = [net(depth, *rest, memory) for net, memory in zip(networks, memories, strict=True)]
-        assert export.difference(*answers) <= export.SAME_DECISION
+        ours, theirs = answers
+        assert export.difference(ours[:-1], theirs[:-1]) <= 1e-5
+        # The logarithm of a belief moves by 50 for each metre, of which float32 rounds 4 to 2.4e-7 at every step.
+        assert export.difference(ours[-1:], theirs[-1:]) <= export.SAME_DECISION
         memories = [answer[-1] for answer in answers]
     with pytest.raises(ArtifactError, match="no ONNX file beside the manifest"):
         onnx_student(Artifact.load(run))
