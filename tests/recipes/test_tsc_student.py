@@ -191,7 +191,7 @@ def test_imitation_of_one_window_lowers_its_loss(recipe: ModuleType, module: Mod
     losses = [recipe.imitate(parts, cfg, window, 0) for _ in range(30)]
     first, last = losses[0], losses[-1]
     assert parts.representation is None
-    for name in ("loss_behaviour", "loss_parameters", "loss_obstacle"):
+    for name in ("loss_behaviour", "loss_parameters", "loss_obstacle", "loss_progress"):
         assert last[name] < 0.75 * first[name], name
     parts.env.close()
 
