@@ -16,7 +16,7 @@ from held_fixed import INFERRED, privileged_loss
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 from torchrl.objectives.value import GAE
 
@@ -38,6 +38,7 @@ from agility_rl.modules import (
 from agility_rl.motion import MotionDataset
 from agility_rl.training.ppo import PPOUpdate
 from agility_rl.training.precision import hidden_precision
+from agility_rl.training.replay import SeededReplay
 from agility_rl.training.rollout import Rollout
 from agility_rl.training.seeding import Seeds, seed_everything
 
@@ -60,7 +61,7 @@ class Components:
     discriminator: Discriminator
     predictor: Predictor
     prior: SkillPrior
-    replay: TensorDictReplayBuffer
+    replay: SeededReplay
     rollout: Rollout
     advantage: GAE
     discriminator_loss: DiscriminatorLoss
@@ -180,10 +181,8 @@ def build(cfg: Config) -> Components:
         discriminator=discriminator,
         predictor=predictor,
         prior=SkillPrior(decay=1.0 - im.prior_weight, temperature=im.prior_temperature).to(device),
-        replay=TensorDictReplayBuffer(
-            storage=LazyTensorStorage(im.replay, device=device),
-            batch_size=im.batch_size,
-            generator=seeds.generator("replay"),
+        replay=SeededReplay(
+            seeds.generator("replay"), storage=LazyTensorStorage(im.replay, device=device), batch_size=im.batch_size
         ),
         rollout=rollout,
         advantage=GAE(gamma=ppo.gamma, lmbda=ppo.lmbda, value_network=None, time_dim=0),

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from agility_rl import behaviours
+from agility_rl.tensors import worthwhile
 
 
 class CommandSampler:
@@ -52,20 +53,20 @@ class CommandSampler:
 
     def resample(self, mask: Tensor) -> None:
         """Redraw the rows of a bool mask ``[N]`` and restart their clocks."""
-        rows = mask.nonzero()[:, 0]
-        if not len(rows):
+        if not worthwhile(mask):
             return
-        skill = torch.multinomial(self.probabilities, len(rows), replacement=True, generator=self.generator)
+        # Drawn for every robot, so that a GPU need not be asked for how many it is.
+        skill = torch.multinomial(self.probabilities, len(mask), replacement=True, generator=self.generator)
         command = behaviours.sample_commands(skill, self.generator)
-        shift = 2.0 * torch.rand(len(rows), 1, generator=self.generator, device=skill.device) - 1.0
+        shift = 2.0 * torch.rand(len(mask), 1, generator=self.generator, device=skill.device) - 1.0
         self.assign(mask, skill, command, shift)
 
     def assign(self, mask: Tensor, skill: Tensor, command: Tensor, shift: Tensor) -> None:
-        """Set the rows of a bool mask ``[N]`` to given values, one row of each argument per set row."""
+        """Set the rows of a bool mask ``[N]`` to theirs of given values ``[N]``, ``[N, 5]`` and ``[N, 1]``."""
         # New tensors, because observations of earlier steps may still refer to the old ones.
-        self.skill = self.skill.masked_scatter(mask, skill)
-        self.command = self.command.masked_scatter(mask[:, None], command)
-        self.shift = self.shift.masked_scatter(mask[:, None], shift)
+        self.skill = torch.where(mask, skill, self.skill)
+        self.command = torch.where(mask[:, None], command, self.command)
+        self.shift = torch.where(mask[:, None], shift, self.shift)
         self.age = self.age.masked_fill(mask, 0)
 
     def advance(self) -> None:

@@ -53,10 +53,8 @@ class Decisions:
 
     def begin(self, mask: Tensor) -> None:
         """Forget the past of the rows of a bool mask ``[N]``: their next decision changes nothing."""
-        rows = int(mask.sum())
-        skill = torch.zeros(rows, dtype=torch.int64, device=mask.device)
-        none = torch.zeros(rows, len(behaviours.COMMANDS) + 1, device=mask.device)
-        self.commands.assign(mask, skill, none[:, 1:], none[:, :1])
+        commands = self.commands
+        commands.assign(mask, *(torch.zeros_like(was) for was in (commands.skill, commands.command, commands.shift)))
         self.fresh = self.fresh | mask
 
     def decide(self, behaviour: Tensor, parameters: Tensor) -> None:

@@ -14,6 +14,7 @@ from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.obstacles import RAMP_LENGTH, bar_shape, ramp_height, ramp_shapes
 from agility_rl.simulation import Piece, Simulator
 from agility_rl.simulation.scenery import PARKED_DEPTH
+from agility_rl.tensors import worthwhile
 
 NOTHING, BAR, RAMP = range(3)
 HALF_WIDTH = 1.0
@@ -84,7 +85,7 @@ class Encounters:
 
     def place(self, mask: Tensor, simulator: Simulator, commands: CommandSampler) -> None:
         """Put something before the robots of the rows of a bool mask ``[N]``, where they stand and head for now."""
-        if not bool(mask.any()):
+        if not worthwhile(mask):
             return
         n, device = len(mask), mask.device
         there, far, aside, turned, high = torch.rand(5, n, generator=self.generator, device=device)

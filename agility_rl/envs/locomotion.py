@@ -23,6 +23,7 @@ from agility_rl.envs.robots import CLEARANCE, Pushes, Robots
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, Termination
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator, make_simulator
+from agility_rl.tensors import rows_of
 
 EDGE = 1.0
 """How far beyond the square of the starts an episode on a height field goes on [m]; the field ends a metre further."""
@@ -260,7 +261,7 @@ class LocomotionEnv(EnvBase):
             joint_position=start["joint_position"],
             joint_velocity=start["joint_velocity"],
         )
-        return None if past is None else past[number[mask]]
+        return None if past is None else past[number[rows_of(mask)]]
 
     def _ground(self, position: Tensor) -> Tensor:
         """Height [m] of what robots stand on under horizontal positions ``[N, 2]``, as ``[N]``."""

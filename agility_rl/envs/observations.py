@@ -14,6 +14,7 @@ from agility_rl.envs.commands import CommandSampler
 from agility_rl.envs.randomization import uniform
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import features
+from agility_rl.tensors import rows_of
 
 
 class RecentFrames:
@@ -42,9 +43,11 @@ class RecentFrames:
         self._ring[:, self._oldest] = frame
         self._oldest = (self._oldest + 1) % self._ring.shape[1]
 
-    def fill(self, mask: Tensor, frames: Tensor) -> None:
-        """Replace those of the K rows of a bool mask ``[N]`` by ``[K, S, F]``, oldest first."""
-        self._ring[mask] = frames.roll(self._oldest, 1)
+    def fill(self, mask: Tensor, rows: Tensor, frames: Tensor) -> None:
+        """Replace those of the rows of a bool mask ``[N]``, all of them among rows ``[K]``, by ``[K, S, F]``, oldest
+        first."""
+        frames = torch.where(mask[rows, None, None], frames.roll(self._oldest, 1), self._ring[rows])
+        self._ring.index_copy_(0, rows, frames)
 
     def read(self, offsets: Tensor) -> Tensor:
         """A copy ``[N, O, F]`` of the frames so many steps after the oldest, int64 ``[O]``."""
@@ -94,16 +97,17 @@ class ObservationGroups:
         Args:
             mask: the rows.
             state: the present.
-            past: ``[K, span, 49]`` of the K rows, frames of the recorded motion that led here, for discriminators
-                that look back.
+            past: ``[K, span, 49]`` of :func:`~agility_rl.tensors.rows_of` the mask, frames of the recorded motion that
+                led here, for discriminators that look back.
         """
         touched = state.foot_contact > features.FOOT_CONTACT_FORCE
         row = mask[:, None]
         self.touched = torch.where(row, touched, self.touched)
         self.history = torch.where(row[..., None], self._measure(state, touched)[:, None], self.history)
-        present = _motion_frame(state)[mask, None]
+        rows = rows_of(mask)
+        present = _motion_frame(state)[rows, None]
         past = present.expand(-1, int(self.motion_offsets[-1]), -1) if past is None else past
-        self._motion.fill(mask, torch.cat((past, present), 1))
+        self._motion.fill(mask, rows, torch.cat((past, present), 1))
 
     def update(self, state: LocomotionState) -> None:
         """Append the present to the memories of every robot."""

@@ -86,7 +86,7 @@ class Rhythm:
         self._last, self._stance = torch.zeros(num_robots, 4, device=device), torch.zeros(num_robots, device=device)
         self._fresh = torch.ones(num_robots, 1, dtype=torch.bool, device=device)
         first, second = zip(*constants.FOOT_PAIRS, strict=True)
-        self._first, self._second = list(first), list(second)
+        self._first, self._second = (torch.tensor(feet, device=device) for feet in (first, second))
 
     def begin(self, mask: Tensor) -> None:
         """Forget the past of the rows of a bool mask ``[N]``."""

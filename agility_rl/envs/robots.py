@@ -14,7 +14,7 @@ from agility_rl.envs.randomization import NOMINAL, Randomization, sample_paramet
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator
-from agility_rl.tensors import constant
+from agility_rl.tensors import constant, worthwhile
 
 STRIDE = 0.5
 """Time constant over which a robot's velocities are averaged [s]: a dog does not walk at a constant speed."""
@@ -186,5 +186,5 @@ class Pushes:
         if self.interval is None:
             return
         mask = (step_count + self.phase) % self.interval == self.interval - 1
-        if bool(mask.any()):
+        if worthwhile(mask):
             simulator.push(mask, self.velocity * uniform((len(mask), 2), (-1.0, 1.0), self.generator))

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from agility_rl.envs.layout import CourseLayout
 from agility_rl.envs.obstacles import SEESAW_TILT
+from agility_rl.tensors import rows_of
 
 GRID_X = tuple(0.1 * index for index in range(12))
 """Distances ahead of the trunk [m] (method notes, section 5.4)."""
@@ -86,7 +87,8 @@ class HeightScan:
         # Only the obstacles that reach into a robot's grid are looked up: mostly one or none of them.
         middle = position + self._ahead * torch.stack((yaw.cos(), yaw.sin()), -1)
         near = (layout.position - middle[:, None]).norm(dim=-1) < self._circle + self._radius
-        row, obstacle = near.nonzero().unbind(-1)
+        pair = rows_of(near.flatten())
+        row, obstacle = pair // near.shape[1], pair % near.shape[1]
         turn = yaw[row] - layout.yaw[row, obstacle]
         local = layout.local(position[:, None])[row, obstacle, 0]
         points = (_frame(turn, local) / CELL).flatten(0, 1) @ self._grid  # cells, [2M, 132]
@@ -108,7 +110,8 @@ class HeightScan:
 
     def _with_walls(self, heights: Tensor, position: Tensor, yaw: Tensor) -> Tensor:
         rim = self._ahead + self._radius
-        close = ((position < rim) | (position > self._size - rim)).any(-1).nonzero()[:, 0]
+        near = ((position < rim) | (position > self._size - rim)).any(-1)
+        close = rows_of(near)
         points = _frame(yaw[close], position[close]) @ self._grid  # [M, 2, 132]
         outside = ((points < 0.0) | (points > self._size[:, None])).any(1)
         wall = torch.where(outside, self.layout.wall_height[close, None], 0.0)

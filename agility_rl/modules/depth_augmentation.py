@@ -92,7 +92,7 @@ class DepthAugmentation(TensorDictModuleBase):
 
     def augment(self, images: Tensor) -> Tensor:
         """Disturbed copies of float32 images ``[*B, H, W]``, whatever the mode."""
-        if self.generator.device != images.device:
+        if self.generator.device.type != images.device.type:
             raise ValueError(
                 f"the generator is on {self.generator.device}, the images are on {images.device}; build it by "
                 f"torch.Generator({str(images.device)!r})"

@@ -10,6 +10,8 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from agility_rl.tensors import rows_of
+
 
 class Rollout:
     """Steps a batched environment with a policy and stores ``[T, N]`` experience in preallocated memory.
@@ -73,10 +75,9 @@ class Rollout:
             if step:
                 self._storage["next", "state_value"][step - 1] += value.masked_fill(self._last_done, 0.0)
             self._last_done = after["done"]
-            ended = self._last_done[:, 0]
-            if ended.any():
-                last = self.value(after[ended])
-                self._storage["next", "state_value"][step][ended] = last
+            if len(ended := rows_of(self._last_done[:, 0])):
+                last = self.value(after[ended]).masked_fill(~self._last_done[ended], 0.0)
+                self._storage["next", "state_value"][step].index_copy_(0, ended, last)
             carrier = upcoming
         assert self._storage is not None
         self.carrier = carrier

@@ -78,17 +78,18 @@ def test_without_a_period_nothing_is_redrawn(generator: torch.Generator) -> None
     assert sampler.skill.tolist() == [1, 4] and (sampler.command == 1).all()
 
 
-def test_assign_fills_the_chosen_rows_in_order(generator: torch.Generator) -> None:
+def test_assign_fills_the_chosen_rows(generator: torch.Generator) -> None:
     sampler = CommandSampler(4, generator, period=None)
     before = sampler.skill, sampler.command, sampler.shift
     sampler.assign(
         torch.tensor([False, True, False, True]),
-        torch.tensor([3, 2]),
-        torch.arange(10.0).reshape(2, 5),
-        torch.tensor([[0.5], [-0.5]]),
+        torch.tensor([1, 3, 4, 2]),
+        torch.arange(20.0).reshape(4, 5),
+        torch.tensor([[0.1], [0.5], [0.2], [-0.5]]),
     )
     assert sampler.skill.tolist() == [0, 3, 0, 2]
-    assert sampler.command[1].tolist() == [0, 1, 2, 3, 4] and sampler.command[3].tolist() == [5, 6, 7, 8, 9]
+    assert sampler.command[1].tolist() == [5, 6, 7, 8, 9] and sampler.command[3].tolist() == [15, 16, 17, 18, 19]
+    assert not sampler.command[0].any() and not sampler.command[2].any()
     assert sampler.shift[:, 0].tolist() == [0.0, 0.5, 0.0, -0.5]
     assert all(not entry.any() for entry in before)  # observations of earlier steps may refer to them
 

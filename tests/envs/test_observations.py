@@ -91,7 +91,8 @@ def test_a_ring_of_frames_is_a_list_of_which_the_oldest_is_dropped() -> None:
     expected = torch.zeros(2, 4, 3)
     for step in range(11):
         if step in (3, 8):  # one robot begins anew, wherever the ring has come to
-            frames.fill(torch.tensor([False, True]), fresh := torch.randn(1, 4, 3, generator=generator))
+            fresh = torch.randn(1, 4, 3, generator=generator)
+            frames.fill(torch.tensor([False, True]), torch.tensor([1]), fresh)
             expected = torch.cat((expected[:1], fresh))
         if step == 6:
             whole = frames.all()

@@ -1,0 +1,148 @@
+"""How fast is a training of stage 1 on a GPU at several sizes, and where does it wait for the host?
+
+In turns: bare ``mujoco_warp.step`` captured as a graph, our simulator, ``LocomotionEnv.step``, a roll-out with policy
+and critic; then whole iterations; as a preset of ``recipes/bbc_pretrain.py`` trains, on synthetic gaits. At last every
+place of the package where steps and roll-outs wait for the GPU (``torch.cuda.set_sync_debug_mode``).
+
+    python benchmarks/gpu_rollout.py --robots 1024 4096 16384
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import math
+import statistics
+import time
+import traceback
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+from engines import bare_step
+from plain_ppo import PHASES, load_recipe
+from tensordict import TensorDict
+from torch import Tensor
+
+from agility_rl import keys
+from agility_rl.go2 import constants
+
+SHOWN = ("bare", "simulator", "env.step", "roll-out", "iteration")
+OURS = ("agility_rl", "recipes")
+
+
+def seconds(work: Callable[[], object], device: torch.device) -> float:
+    """Time of a piece of work, until the device has done it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    start = time.perf_counter()
+    work()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter() - start
+
+
+@contextmanager
+def waits() -> Iterator[Counter[str]]:
+    """Count the places of the package at which the host waits for the GPU."""
+    places: Counter[str] = Counter()
+
+    def note(message: Warning | str, *where: Any, **options: Any) -> None:
+        if "synchronizing" in str(message):
+            frames = traceback.extract_stack()[:-1]
+            ours = [frame for frame in frames if set(OURS) & set(Path(frame.filename).parts)] or frames
+            places[f"{Path(ours[-1].filename).name}:{ours[-1].lineno} {ours[-1].line}"] += 1
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = note
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            yield places
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+
+
+def contenders(parts: Any, steps: int) -> dict[str, Callable[[], object]]:
+    """What is timed in turns; each takes so many control steps, the roll-out those of its preset."""
+    env, robots = parts.env, parts.env.num_robots
+    pose = torch.tensor(constants.DEFAULT_POSE, device=env.device)
+    scale = torch.tensor(constants.ACTION_SCALE, device=env.device)
+    targets = pose + 0.05 * torch.randn(steps, robots, 12, device=env.device)
+    bare = bare_step("warp", argparse.Namespace(robots=robots, device=str(env.device)))
+    policy = parts.bbc.privileged_policy()
+    env.reset()
+
+    def every(step: Callable[[Tensor], object]) -> Callable[[], object]:
+        return lambda: [step(target) for target in targets]
+
+    def step_env(target: Tensor) -> None:
+        env.step(TensorDict({keys.ACTION: (target - pose) / scale}, [robots]))
+
+    return {
+        "bare": every(bare),
+        "simulator": every(env.simulator.step),
+        "env.step": every(step_env),
+        "roll-out": lambda: parts.rollout.collect(policy),
+    }
+
+
+def measure(recipe: ModuleType, cfg: Any, args: argparse.Namespace, look: bool) -> None:
+    """Print the figures of one number of robots; ``look`` for waits too."""
+    parts, robots, device = recipe.build(cfg), cfg.env.num_robots, torch.device(args.device)
+    turns = contenders(parts, args.steps)
+    found: dict[str, list[float]] = {name: [] for name in turns}
+    for turn in range(args.rounds + 1):
+        for name, work in turns.items():
+            spent = seconds(work, device)
+            if turn:  # the first turn warms up
+                found[name].append(spent)
+    steps = dict.fromkeys(turns, args.steps) | {"roll-out": cfg.ppo.steps}
+    rate = {name: robots * steps[name] / statistics.median(times) for name, times in found.items()}
+    share = statistics.median(bare / env for bare, env in zip(found["bare"], found["env.step"], strict=True))
+    laps: list[dict[str, float]] = []
+    spent = [seconds(lambda: laps.append(recipe.iterate(parts, cfg, 400 + len(laps))), device) for _ in range(4)]
+    rate["iteration"] = robots * cfg.ppo.steps / statistics.median(spent[1:])
+    most = torch.cuda.max_memory_allocated() / 2**30 if device.type == "cuda" else math.nan
+    print(f"{robots:8}" + "".join(f"{rate[name]:12.0f}" for name in SHOWN) + f"{share:12.1%}{most:8.1f}")
+    print(
+        "         an iteration, s: " + ", ".join(f"{name} {laps[-1][f'time/{name}']:.3f}" for name in PHASES),
+        flush=True,
+    )
+    for name in ("env.step", "roll-out") if look else ():
+        with waits() as places:
+            turns[name]()
+        print(f"waits in {steps[name]} steps of {name}: {sum(places.values())}")
+        for place, count in places.most_common(25):
+            print(f"  {count:4}  {place}")
+    parts.env.close()
+
+
+def main() -> None:
+    """Time and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robots", type=int, nargs="+", default=[1024, 4096, 16384])
+    parser.add_argument("--device", default="cuda", help="of Warp and of everything else")
+    parser.add_argument("--preset", default="cpu", help="preset of bbc_pretrain.py")
+    parser.add_argument("--steps", type=int, default=24, help="control steps of a turn")
+    parser.add_argument("--rounds", type=int, default=5, help="turns of each contender")
+    args = parser.parse_args()
+    recipe, there = load_recipe(), torch.device(args.device).type == "cuda"
+    print(torch.cuda.get_device_name() if there else "CPU", f"- torch {torch.__version__}, control steps a second")
+    print(f"{'robots':>8}" + "".join(f"{name:>12}" for name in SHOWN) + f"{'env/bare':>12}{'GiB':>8}")
+    for robots in args.robots:
+        preset = recipe.PRESETS[args.preset]
+        cfg = replace(preset, simulator="warp", device=args.device, env=replace(preset.env, num_robots=robots))
+        measure(recipe, cfg, args, look=there and robots == args.robots[-1])
+        gc.collect()
+        torch.cuda.empty_cache()
+
+
+if __name__ == "__main__":
+    main()
