@@ -151,6 +151,13 @@ class Glances:
         means = torch.stack(found).mean(0).tolist()
         return {f"glance/{name}": value for name, value in zip(ERRORS, means, strict=True)}
 
+    @torch.no_grad()
+    def measure(self, test: TensorDictBase) -> dict[str, float]:
+        """:data:`ERRORS` of images ``[M]`` as they are, on average."""
+        parts = test.split(self.batch)
+        found = torch.stack([len(part) * torch.stack(self.errors(part, part[keys.DEPTH])) for part in parts])
+        return dict(zip(ERRORS, (found.sum(0) / len(test)).tolist(), strict=True))
+
     def errors(self, sample: TensorDictBase, depth: Tensor) -> tuple[Tensor, ...]:
         """:data:`ERRORS` on images ``[M, 58, 87]``."""
         feature = self.encoder(depth)
@@ -233,11 +240,7 @@ def pretrain(
     metrics: dict[str, float] = {"pretrain/images": float(len(train))}
     for epoch in range(cfg.epochs):
         glances.learn(max(1, len(train) // cfg.batch), 0, represent)
-        with torch.no_grad():
-            parts = test.split(cfg.batch)
-            found = torch.stack([len(part) * torch.stack(glances.errors(part, part[keys.DEPTH])) for part in parts])
-        for name, value in zip(ERRORS, (found.sum(0) / len(test)).tolist(), strict=True):
-            metrics[f"pretrain/{name}"] = value
+        metrics |= {f"pretrain/{name}": value for name, value in glances.measure(test).items()}
         shown = "  ".join(f"{name} {metrics[f'pretrain/{name}']:.3g}" for name in ERRORS)
         print(f"pre-training {epoch + 1}/{cfg.epochs} on {len(train)} images; {len(test)} held out: {shown}")
     return metrics

@@ -161,9 +161,9 @@ class Config(HardwareConfig):
     """Of the depth encoder's layers; ``auto`` is bfloat16 on hardware that multiplies in it."""
     memory: int = 512
     """Units of the GRU (supplement S6)."""
-    encoder_channels: tuple[int, int] = (32, 64)
-    """Of the depth encoder's convolutions (method notes, section 5.9). Most of a student's weights and of its encoder's
-    time are in proportion to the second number."""
+    encoder_channels: tuple[int, ...] = (32, 64)
+    """Of the depth encoder's convolutions: two (method notes, section 5.9), or more (ours), with a max-pool between.
+    Of two, most of a student's weights and of its encoder's time are in proportion to the second number."""
     encoder_hidden: int = 128
     """Units of the depth encoder's hidden linear layer (method notes, section 5.9)."""
     encoder_features: int = 32

@@ -1,6 +1,9 @@
-"""The encoder of depth images: two convolutions, one max-pool, two linear layers."""
+"""The encoder of depth images: convolutions with max-pools between them, two linear layers."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from tensordict import NestedKey
@@ -26,7 +29,8 @@ class DepthEncoder(TensorDictModule):
         out_features: F.
         height: rows of an image.
         width: columns of an image.
-        channels: of the two convolutions.
+        channels: of the convolutions, two as published, or more (ours): a kernel of 5, then kernels of 3, a max-pool
+            after each but the last.
         hidden: size of the hidden linear layer.
         in_key: key of the images.
         out_key: key of the features.
@@ -48,7 +52,7 @@ class DepthEncoder(TensorDictModule):
         *,
         height: int = IMAGE_HEIGHT,
         width: int = IMAGE_WIDTH,
-        channels: tuple[int, int] = (32, 64),
+        channels: Sequence[int] = (32, 64),
         hidden: int = 128,
         in_key: NestedKey = DEPTH,
         out_key: NestedKey = DEPTH_FEATURE,
@@ -70,19 +74,28 @@ class DepthNetwork(nn.Module):
         torch.Size([2, 3, 32])
     """
 
-    def __init__(self, height: int, width: int, channels: tuple[int, int], hidden: int, out_features: int) -> None:
+    def __init__(self, height: int, width: int, channels: Sequence[int], hidden: int, out_features: int) -> None:
         super().__init__()
-        rows, columns = (height - 4) // 2 - 2, (width - 4) // 2 - 2  # kernel 5, pool 2, kernel 3
+        if len(channels) < 2:
+            raise ValueError(f"expected the channels of two convolutions or more, got {list(channels)}")
+        rows, columns = height - 4, width - 4
+        layers: list[nn.Module] = [nn.Conv2d(1, channels[0], 5)]
+        for before, after in pairwise(channels):
+            layers += [nn.MaxPool2d(2, 2), nn.ELU(inplace=True), nn.Conv2d(before, after, 3)]
+            rows, columns = rows // 2 - 2, columns // 2 - 2
         if min(rows, columns) < 1:
-            raise ValueError(f"images must have at least 10 rows and columns for kernels (5, 3), got {height}, {width}")
+            least = 1
+            for _ in channels[1:]:
+                least = 2 * (least + 2)
+            raise ValueError(
+                f"images must have at least {least + 4} rows and columns for {len(channels)} convolutions, "
+                f"got {height}, {width}"
+            )
         self.height, self.width = height, width
         self.precision = torch.float32
-        self.convolutions = nn.Sequential(
-            *(nn.Conv2d(1, channels[0], 5), nn.MaxPool2d(2, 2), nn.ELU(inplace=True)),
-            *(nn.Conv2d(channels[0], channels[1], 3), nn.ELU(inplace=True)),
-        )
+        self.convolutions = nn.Sequential(*layers, nn.ELU(inplace=True))
         self.linear = nn.Sequential(
-            *(_FlattenPixels(), _PixelLinear(channels[1], rows, columns, hidden)),
+            *(_FlattenPixels(), _PixelLinear(channels[-1], rows, columns, hidden)),
             *(nn.ELU(), nn.Linear(hidden, out_features)),
         )
 

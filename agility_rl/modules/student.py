@@ -69,7 +69,7 @@ class RecurrentStudent(nn.Module):
         allowed: indices of the behaviours that it may choose; ``None`` for all.
         num_place: size of ``place``, as its teacher's: 0 or 8.
         memory: units of the GRU.
-        encoder_channels: of the depth encoder's two convolutions.
+        encoder_channels: of the depth encoder's convolutions.
         encoder_hidden: units of its hidden linear layer.
         encoder_features: numbers that it makes of an image.
         heading_gate: see :data:`HEADING_GATE`.
@@ -101,7 +101,7 @@ class RecurrentStudent(nn.Module):
         num_place: int = 0,
         *,
         memory: int = 512,
-        encoder_channels: tuple[int, int] = (32, 64),
+        encoder_channels: Sequence[int] = (32, 64),
         encoder_hidden: int = 128,
         encoder_features: int = NUM_FEATURES,
         heading_gate: float = HEADING_GATE,

@@ -20,6 +20,18 @@ def test_layers_are_those_of_the_supplement() -> None:
     assert [(layer.in_features, layer.out_features) for layer in linear] == [(64 * 25 * 39, 128), (128, 32)]
 
 
+def test_more_convolutions_with_a_pool_between() -> None:
+    encoder = DepthEncoder(48, channels=(4, 6, 5), hidden=7)
+    layers = [type(layer) for layer in encoder.module.convolutions]
+    pool = [nn.MaxPool2d, nn.ELU]
+    assert layers == [nn.Conv2d, *pool, nn.Conv2d, *pool, nn.Conv2d, nn.ELU]
+    # rows 58 - 4 = 54, 27 - 2 = 25, 12 - 2 = 10; columns 87 - 4 = 83, 41 - 2 = 39, 19 - 2 = 17
+    assert encoder.module.convolutions(torch.zeros(1, 1, 58, 87)).shape == (1, 5, 10, 17)
+    linear = [layer for layer in encoder.module.linear if isinstance(layer, nn.Linear)]
+    assert [(layer.in_features, layer.out_features) for layer in linear] == [(5 * 10 * 17, 7), (7, 48)]
+    assert encoder.module(torch.rand(2, 58, 87)).shape == (2, 48)
+
+
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
 def test_shapes_and_nested_keys(batch: tuple[int, ...]) -> None:
     encoder = DepthEncoder(8, in_key=("camera", "depth"), out_key=("latent", "depth"))
@@ -49,6 +61,11 @@ def test_errors() -> None:
         DepthEncoder().module(torch.zeros(2, 87, 58))
     with pytest.raises(ValueError, match="at least 10 rows"):
         DepthEncoder(height=6)
+    with pytest.raises(ValueError, match="at least 20 rows and columns for 3 convolutions, got 19, 87"):
+        DepthEncoder(height=19, channels=(2, 2, 2))
+    DepthEncoder(height=20, channels=(2, 2, 2))
+    with pytest.raises(ValueError, match=r"two convolutions or more, got \[8\]"):
+        DepthEncoder(channels=(8,))
 
 
 def test_layers_in_bfloat16_leave_features_and_gradients_in_float32() -> None:

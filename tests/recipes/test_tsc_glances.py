@@ -1,0 +1,97 @@
+"""Images are collected by one recipe and learned from by another; the student goes on from there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from agility_rl.deploy.artifact import Artifact
+from agility_rl.modules import RecurrentStudent
+
+Module = Callable[[str], ModuleType]
+
+
+@pytest.fixture
+def student(module: Module, untrained: Path, untrained_teacher: Path, tmp_path: Path) -> Any:
+    """A run of a tiny student."""
+    recipe = module("tsc_student")
+    cfg = recipe.PRESETS["smoke"]
+    cfg = replace(cfg, env=replace(cfg.env, num_threads=1), runs=tmp_path, teacher=untrained_teacher, bbc=untrained)
+    return replace(cfg, iterations=1, byol=False, name="student")
+
+
+@pytest.fixture
+def images(module: Module, student: Any, tmp_path: Path) -> Path:
+    """A folder of images of four robots."""
+    recipe = module("tsc_images")
+    run = module("tsc_student").train(student)
+    options = {"student": run, "teacher": student.teacher, "bbc": student.bbc, "runs": tmp_path}
+    return recipe.main(recipe.Config(**options, windows=1, num_robots=4))
+
+
+def options_of(folder: Path, **others: Any) -> dict[str, Any]:
+    given = {"images": (folder / "images",), "student": folder / "student", "runs": folder, "batch": 8}
+    return given | {"minutes": 0.002} | others
+
+
+def test_images_with_what_they_should_tell(images: Path) -> None:
+    rows = load_file(images / "images.safetensors")
+    assert rows["depth"].shape == (48, 4, 58, 87) and rows["depth"].dtype == torch.uint8
+    assert len(rows["depth"].flatten(0, 1).flatten(1).unique(dim=0)) > 100
+    assert rows["terrain_latent"].shape == (48, 4, 32) and rows["place"].shape == (48, 4, 8)
+    assert rows["obstacle"].shape == rows["progress"].shape == (48, 4)
+
+
+def test_glances_move_what_sees_and_nothing_else(
+    module: Module, images: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = module("tsc_glances")
+    run = recipe.main(recipe.Config(**options_of(images.parent)))
+    before, after = (Artifact.load(folder / "policy", kind="student") for folder in (images.parent / "student", run))
+    moved = {name.split(".")[0] for name in after.state if not torch.equal(after.state[name], before.state[name])}
+    assert moved == {"depth_encoder", "memory"}
+    seeing = ("depth_encoder.", "memory.glance.")
+    assert all(torch.equal(after.state[n], before.state[n]) for n in after.state if not n.startswith(seeing))
+    out = capsys.readouterr().out
+    assert "144 images to learn from, 48 held out" in out and "before; held out: error_latent" in out
+    same = ("teacher", "bbc", "course", "camera", "control_period", "network")
+    assert all(after.manifest[name] == before.manifest[name] for name in same)
+
+
+def test_an_encoder_of_other_sizes_keeps_the_rest(module: Module, images: Path, student: Any) -> None:
+    recipe = module("tsc_glances")
+    other = {"encoder_channels": (4, 6, 8), "encoder_features": 12}
+    run = recipe.main(recipe.Config(**options_of(images.parent, **other)))
+    artifact = Artifact.load(run / "policy", kind="student")
+    before = Artifact.load(images.parent / "student" / "policy").state
+    assert artifact.manifest["network"]["encoder_channels"] == [4, 6, 8]
+    network = RecurrentStudent(**artifact.manifest["network"])
+    artifact.fill(network)
+    for name in ("memory.cell.weight_hh", "actor.module.0.module.trunk.layers.0.weight", "memory.fusion.2.weight"):
+        assert torch.equal(artifact.state[name], before[name]), name
+    assert artifact.state["memory.fusion.0.weight"].shape[1] == before["memory.fusion.0.weight"].shape[1] + 4
+    goes_on = replace(student, init_from=run, name="goes_on", **other, glance=replace(student.glance, steps=1))
+    assert (module("tsc_student").train(goes_on) / "policy" / "manifest.json").is_file()
+
+
+def test_options_that_cannot_be(module: Module, images: Path) -> None:
+    recipe, collect = module("tsc_glances"), module("tsc_images")
+    for others, message in (
+        ({"images": ()}, "--images: expected one folder"),
+        ({"held_out": 1.0}, r"--held-out: expected a share within \(0, 1\), got 1.0"),
+        ({"batch": 0}, "--batch and --reports of at least 1"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            recipe.main(recipe.Config(**options_of(images.parent, **others)))
+    with pytest.raises(FileNotFoundError, match=r"student/images.safetensors: no such file; expected a folder that"):
+        recipe.main(recipe.Config(**options_of(images.parent, images=(images.parent / "student",))))
+    for others, message in (({"led": 1.5}, "--led: expected a share"), ({"minutes": 0.0}, "--minutes above 0")):
+        with pytest.raises(ValueError, match=message):
+            collect.main(collect.Config(**others))
