@@ -159,7 +159,7 @@ def test_glances_of_the_same_images_lower_their_errors(recipe: ModuleType, modul
 
 
 def test_a_glance_knows_how_sure_it_is(recipe: ModuleType, module: Module, smoke: Any) -> None:
-    """The loss of the place is Laplace's negative log-likelihood, but for the logarithm of 2, times the scale.
+    """The loss of the place is Laplace's negative log-likelihood, but for the logarithm of 2, times scale and lever.
 
     Who corrects by a constant is as far off as what was expected is, and that constant.
     """
@@ -177,7 +177,7 @@ def test_a_glance_knows_how_sure_it_is(recipe: ModuleType, module: Module, smoke
     said = moved(truth, noise * torch.tensor([0.5, 0.5, 0.2])) + correction
     scale = torch.cat((scale, scale[2:]))
     density = torch.distributions.Laplace(said, scale).log_prob(truth) + math.log(2.0)
-    torch.testing.assert_close(found["loss_place"], -(scale * density).mean())
+    torch.testing.assert_close(found["loss_place"], -(torch.tensor([1.0, 1.0, 3.0, 3.0]) * scale * density).mean())
     torch.testing.assert_close(found["error_place"], (truth - said).abs().mean())
     parts.env.close()
 
