@@ -11,6 +11,7 @@ from typing import Literal
 from hardware import HardwareConfig
 
 from agility_rl.behaviours import BEHAVIOURS, RESAMPLE_PERIOD
+from agility_rl.envs.obstacles import BOX_HALF
 from agility_rl.motion.stride_patterns import FREQUENCY_GROWTH
 from agility_rl.training.precision import Precision
 
@@ -48,6 +49,14 @@ class EnvConfig:
     ridges: the largest; strips have all of it, half of it or none."""
     encounters: float = 0.0
     """Share of the commands on which a bar (before canter and jump) or a ramp lies in the way (ours)."""
+    boxes: float = 0.0
+    """Share of boxes, instead of bars, before robots that begin to jump (ours)."""
+    lowest_box: float = 0.10
+    """Height of the lowest box [m]."""
+    highest_box: float = 0.30
+    """Height of the highest one [m]."""
+    shares: tuple[float, ...] = ()
+    """How often each of the five behaviours is commanded, in place of the prior (ours)."""
     randomize: bool = True
     push_interval: float | None = 8.0
     """Seconds (released code)."""
@@ -173,6 +182,8 @@ class ImitationConfig:
     anchor: float = 0.0
     """Weight of staying near the policy of ``--init-from`` (squared distance of the mean actions): PPO then mends falls
     and leaves good gaits alone, which a discriminator that starts anew would not."""
+    anchor_jump: float = 1.0
+    """Factor on the anchor while a jump is commanded: a start that has never seen a box is no example before one."""
     anchor_turn_rate: float | None = None
     """Commanded turn rate [rad/s] beyond which the anchor lets go: a start that goes straight is no example there."""
     warm_up: int = 0
@@ -256,7 +267,7 @@ class Config(HardwareConfig):
 
 
 CHANGEABLE: tuple[str, ...] = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight", "env.progress_left")
-CHANGEABLE += ("env.standing_starts", "env.canter_stance", "env.walk_emphasis")
+CHANGEABLE += ("env.lowest_box", "env.highest_box", "env.standing_starts", "env.canter_stance", "env.walk_emphasis")
 CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
 """Options that may change during a run."""
 
@@ -272,11 +283,18 @@ def check(cfg: Config) -> None:
     for name, least, most, expected in (
         ("standing_starts", 0.0, 1.0, "a share from 0 to 1"),
         ("canter_stance", -1.0, 1.0, "a share of time"),
+        ("boxes", 0.0, 1.0, "a share from 0 to 1"),
+        ("lowest_box", 0.0, 2.0 * BOX_HALF[2], "a height of boxes [m]"),
+        ("highest_box", 0.0, 2.0 * BOX_HALF[2], "a height of boxes [m]"),
         ("walk_emphasis", 0.0, math.inf, "a factor of at least 0"),
     ):
         later = [value for _, option, value in cfg.changes if option.replace("-", "_") == f"env.{name}"]
         if bad := [value for value in (getattr(cfg.env, name), *later) if not least <= value <= most]:
             raise ValueError(f"--env.{name.replace('_', '-')}: expected {expected}, got {bad[0]}")
+    if cfg.env.shares and (
+        len(cfg.env.shares) != len(BEHAVIOURS) or min(cfg.env.shares) < 0 or not sum(cfg.env.shares)
+    ):
+        raise ValueError(f"--env.shares: expected {len(BEHAVIOURS)} numbers, none below 0, got {cfg.env.shares}")
     for name, least in (("start", 1), ("every", 1), ("episodes", 1), ("seconds", 2), ("switches", 0)):
         if (value := getattr(cfg.trials, name)) is not None and value < least:
             raise ValueError(f"--trials.{name}: expected at least {least}, got {value}")

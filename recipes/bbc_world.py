@@ -61,6 +61,7 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
         resample_period=cfg.env.resample_period,
         patterns=patterns,
         encounters=cfg.env.encounters,
+        boxes=cfg.env.boxes,
         motion_offsets=cfg.motion.offsets,
         seed=seeds.integer("environment"),
     )

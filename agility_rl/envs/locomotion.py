@@ -61,7 +61,8 @@ class LocomotionEnv(EnvBase):
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
         patterns: rhythm of each behaviour, as :class:`agility_rl.envs.rhythm.Rhythm` takes them, for the reward term
             ``rhythm``; ``None`` hears none.
-        encounters: share of the commands on which a bar or a ramp lies in the way (:class:`Encounters`).
+        encounters: share of the commands on which a bar, a ramp or a box lies in the way (:class:`Encounters`).
+        boxes: share of boxes, instead of bars, before robots that begin to jump.
         motion_offsets: which discriminator frames ``motion`` holds, in control steps from the oldest; ``[N, H, 49]``
             then has their number H. With ``past_motion`` in the reference, those before an episode are the dog's.
         seed: seed of all randomness in the environment.
@@ -97,6 +98,7 @@ class LocomotionEnv(EnvBase):
         push_velocity: float = 0.5,
         patterns: TensorDictBase | None = None,
         encounters: float = 0.0,
+        boxes: float = 0.0,
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
         seed: int = 0,
     ) -> None:
@@ -130,7 +132,7 @@ class LocomotionEnv(EnvBase):
         n = num_robots
         interval = None if push_interval is None else round(push_interval / self.dt)
         self.pushes = Pushes(n, self.generator, interval, push_velocity)
-        self.encounters = Encounters(n, self.generator, encounters) if encounters else None
+        self.encounters = Encounters(n, self.generator, encounters, boxes) if encounters else None
         self.robots = Robots(self.simulator, self.generator, self._ground)
         self.rhythm = None if patterns is None else Rhythm(n, patterns.to(device))
         self._step_count = torch.zeros(n, dtype=torch.int64, device=device)
@@ -197,7 +199,7 @@ class LocomotionEnv(EnvBase):
             self.commands.resample(mask)
         past = self._place(mask)
         if self.encounters is not None:
-            self.encounters.place(mask, self.simulator, self.commands)
+            self.encounters.begin(mask, self.simulator, self.commands)
         if self.randomization is not None:
             self.robots.randomize(mask, self.randomization)
         self._step_count = self._step_count.masked_fill(mask, 0)
@@ -229,7 +231,8 @@ class LocomotionEnv(EnvBase):
         terminated = torch.stack([failed(state) for failed in self.terminations]).any(0)[:, None]
         truncated = ((self._step_count >= self.max_steps) | self._at_edge())[:, None] & ~terminated
 
-        self.commands.advance()
+        held = None if self.encounters is None else self.encounters.holding(self.simulator, self.commands)
+        self.commands.advance(held)
         if self.encounters is not None:
             self.encounters.advance(self.simulator, self.commands)
         self.observations.update(state)
