@@ -50,11 +50,13 @@ class EnvConfig:
     encounters: float = 0.0
     """Share of the commands on which a bar (before canter and jump) or a ramp lies in the way (ours)."""
     boxes: float = 0.0
-    """Share of boxes, instead of bars, before robots that begin to jump (ours)."""
+    """Share of the jumps that begin before a box (ours)."""
     lowest_box: float = 0.10
     """Height of the lowest box [m]."""
     highest_box: float = 0.30
     """Height of the highest one [m]."""
+    low_feet_weight: float = 0.0
+    """Weight of a penalty for feet that come to a box lower than its top (ours) [1/m]."""
     shares: tuple[float, ...] = ()
     """How often each of the five behaviours is commanded, in place of the prior (ours)."""
     randomize: bool = True

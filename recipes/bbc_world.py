@@ -20,6 +20,7 @@ from agility_rl.envs.rewards import (
     jump_height_peak,
     jump_height_window,
     lateral_progress,
+    low_feet,
     rhythm,
     turn_progress,
     velocity_progress,
@@ -80,6 +81,8 @@ def rewards(cfg: EnvConfig) -> dict[str, RewardTerm]:
         terms["lateral_progress"] = RewardTerm(cfg.lateral_weight, lateral_progress)
     if cfg.rhythm_weight:
         terms["rhythm"] = RewardTerm(cfg.rhythm_weight, rhythm)
+    if cfg.low_feet_weight:
+        terms["low_feet"] = RewardTerm(-cfg.low_feet_weight, low_feet)
     terms["collision"] = terms["collision"]._replace(weight=cfg.collision_weight)
     return terms
 

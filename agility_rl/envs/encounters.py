@@ -33,9 +33,11 @@ STRAIGHT = 0.3
 its side."""
 DISTANCE = (0.8, 2.5)
 """Way to the near side [m]."""
-BOX_DISTANCE = (0.75, 1.15)
-"""Way to the near side of a box [m]: a leap out of a trot has its feet up after 0.85 m."""
-BOX_SPEED, BOX_JUMP = 1.3, 0.50
+BOX_DISTANCE = (0.85, 1.05)
+"""Way to the near side of a box [m]: a leap out of a trot has its front feet up after 0.85 m."""
+EDGE, CLEAR = 0.12, 0.04
+"""From so far before the near side on [m] feet ought to be so much higher than a box's top [m]."""
+BOX_SPEED, BOX_JUMP = 1.5, 0.50
 """Who meets a box is told to go at least so fast [m/s] and to jump at least so high [m]."""
 BEARING, YAW = 0.2, 0.2
 """How far to the side it lies, and how far it is turned, at most [rad]."""
@@ -45,6 +47,8 @@ REACH = (0.0, 0.7, RAMP_LENGTH + 0.5, BOX_HALF[0] + 0.5)
 """A robot nearer to the middle, along the way through, is at it [m]."""
 ASTRAY = 5.0
 """Who is so far away will not come any more [m]."""
+NUM_OBSERVED, SEEN = 7, 3.0
+"""What a critic is told of an encounter, and how far away it may seem [m]."""
 PATIENCE = 3.0
 """Seconds for which a robot before or on a box is told the same, at most."""
 _BUFFERS = ("kind", "position", "yaw", "lift", "jumped")
@@ -66,8 +70,8 @@ class Encounters:
     Args:
         num_robots: N.
         generator: source of randomness; where it is, the tensors are.
-        share: of the commands on which something lies in the way.
-        boxes: share of boxes, instead of bars, before robots that begin to jump.
+        share: of the commands on which a bar or a ramp lies in the way.
+        boxes: share of the jumps that begin before a box.
 
     Attributes:
         kind: int64 ``[N]``, :data:`NOTHING`, :data:`BAR`, :data:`RAMP` or :data:`BOX`.
@@ -117,8 +121,8 @@ class Encounters:
         straight = commands.command[:, COMMANDS.index("yaw_rate")].abs() <= STRAIGHT
         leaping = self._leaping[commands.skill]
         kind = torch.where(leaping, BAR, torch.where(straight, RAMP, NOTHING))
-        kind = torch.where(commands.jumping & ~self.jumped & (which < self.boxes), BOX, kind)
         kind = torch.where(there < self.share, kind, NOTHING)
+        kind = torch.where(commands.jumping & ~self.jumped & (which < self.boxes), BOX, kind)
         boxed = kind == BOX
         _, _, heading = rotations.to_euler(simulator.root_quaternion)
         bearing = heading + BEARING * (2.0 * aside - 1.0)
@@ -184,6 +188,21 @@ class Encounters:
         height = torch.where(self.kind == RAMP, ramp_height(along), 0.0)
         height = torch.where((self.kind == BOX) & (along.abs() <= BOX_HALF[0]), self.lift, height)
         return torch.where(across.abs() <= HALF_WIDTH, height, 0.0)
+
+    def low_feet(self, feet: Tensor) -> Tensor:
+        """By how much feet at ``[N, 4, 3]`` [m] that come to a box are lower than its top, of all together ``[N]``."""
+        along, across = self._local(feet[..., :2].transpose(0, 1)).unbind(-1)  # [4, N]
+        to_edge = -BOX_HALF[0] - along
+        coming = (self.kind == BOX) & (to_edge >= 0.0) & (to_edge <= EDGE) & (across.abs() <= HALF_WIDTH)
+        return ((self.lift + CLEAR - feet[..., 2].T).clamp(min=0.0) * coming).sum(0)
+
+    def observe(self, simulator: Simulator) -> Tensor:
+        """What lies in the way of each robot, ``[N, 7]`` (:data:`agility_rl.keys.ENCOUNTER`); zero where nothing is."""
+        along, across = self._local(simulator.root_position[:, :2]).clamp(-SEEN, SEEN).unbind(-1)
+        _, _, heading = rotations.to_euler(simulator.root_quaternion)
+        what = [(self.kind == kind).float() for kind in (BAR, RAMP, BOX)]
+        there = torch.stack((*what, self.lift, along, across, (heading - self.yaw).sin()), -1)
+        return there * (self.kind != NOTHING)[:, None]
 
     def _local(self, position: Tensor) -> Tensor:
         x, y = (position - self.position).unbind(-1)

@@ -100,7 +100,7 @@ def test_as_often_as_told(simulator: Simulator) -> None:
         encounters(1.5)
 
 
-def test_boxes_lie_before_robots_that_jump_straight_on(simulator: Simulator) -> None:
+def test_boxes_lie_before_robots_that_jump(simulator: Simulator) -> None:
     yaw = torch.linspace(-3.0, 3.0, N)
     stand(simulator, torch.randn(N, 2), yaw)
     ahead = encounters(boxes=1.0)
@@ -109,7 +109,7 @@ def test_boxes_lie_before_robots_that_jump_straight_on(simulator: Simulator) -> 
         assert ahead.kind.unique().tolist() == [kind]
     ahead.place(EVERYONE, simulator, told("jump"))
     near = (ahead.position - simulator.root_position[:, :2]).norm(dim=-1) - BOX_HALF[0]
-    assert BOX_DISTANCE[0] - 1e-4 <= near.min() and near.max() <= BOX_DISTANCE[1] + 1e-4 and near.std() > 0.1
+    assert BOX_DISTANCE[0] - 1e-4 <= near.min() and near.max() <= BOX_DISTANCE[1] + 1e-4 and near.std() > 0.04
     assert BOX_HEIGHT[0] <= ahead.lift.min() and ahead.lift.max() <= BOX_HEIGHT[1] and ahead.lift.std() > 0.04
     ahead.box_height = (0.2, 0.2)
     ahead.place(EVERYONE, simulator, told("jump"))
@@ -117,6 +117,10 @@ def test_boxes_lie_before_robots_that_jump_straight_on(simulator: Simulator) -> 
     some = encounters(boxes=0.5)
     some.place(EVERYONE, simulator, told("jump"))
     assert 15 <= int((some.kind == BOX).sum()) <= 45 and set(some.kind.tolist()) == {BAR, BOX}
+    alone = encounters(0.0, boxes=1.0)
+    for skill, kind in (("jump", BOX), ("canter", NOTHING), ("walk", NOTHING)):
+        alone.place(EVERYONE, simulator, told(skill))
+        assert alone.kind.unique().tolist() == [kind]
     with pytest.raises(ValueError, match=r"boxes: expected a share from 0 to 1, got -1"):
         encounters(boxes=-1.0)
 
@@ -142,9 +146,9 @@ def test_who_meets_a_box_goes_straight_on_fast_and_high(simulator: Simulator) ->
     half = EVERYONE.clone()
     half[N // 2 :] = False
     for given, wanted in (
-        (slow, (1.3, -0.3, -0.3, 0.50, 0.0)),
+        (slow, (1.5, -0.3, -0.3, 0.50, 0.0)),
         (fast, (1.8, 0.3, 0.3, 0.55, 0.0)),
-        ((slow + fast) / 2.0, (1.55, 0.0, 0.0, 0.525, 0.0)),
+        ((slow + fast) / 2.0, (1.65, 0.0, 0.0, 0.525, 0.0)),
     ):
         commands.command = given.repeat(N, 1)
         ahead.place(half, simulator, commands)
@@ -169,6 +173,45 @@ def test_who_is_before_a_box_or_on_it_is_told_the_same(simulator: Simulator) -> 
     assert not bool(ahead.holding(simulator, commands).any()), "it will not get over it any more"
     ahead.place(EVERYONE, simulator, told("walk"))
     assert not bool(ahead.holding(simulator, told("walk")).any()), "ramps hold nobody"
+
+
+def test_feet_that_come_to_a_box_ought_to_be_higher_than_its_top(simulator: Simulator) -> None:
+    stand(simulator, torch.zeros(N, 2), torch.zeros(N))
+    ahead = encounters(boxes=1.0)
+    ahead.box_height = (0.2, 0.2)
+    ahead.place(EVERYONE, simulator, told("jump"))
+    way = torch.stack((ahead.yaw.cos(), ahead.yaw.sin()), -1)
+    left = torch.stack((-way[:, 1], way[:, 0]), -1)
+
+    def foot(before: float, aside: float, height: float) -> torch.Tensor:
+        """So far before the near side, which is 0.8 m before the middle."""
+        place = ahead.position - (0.8 + before) * way + aside * left
+        return torch.cat((place, torch.full((N, 1), height)), -1)
+
+    # 4 cm above the top are enough: 0.24 m. The third is too far away, the fourth stands on the box.
+    feet = [foot(0.05, 0.0, 0.1), foot(0.1, 0.3, 0.21), foot(0.2, 0.0, 0.0), foot(-0.1, 0.0, 0.2)]
+    wanted = torch.full((N,), 0.14 + 0.03)
+    torch.testing.assert_close(ahead.low_feet(torch.stack(feet, 1)), wanted)
+    feet = [foot(0.05, 1.1, 0.1), foot(0.05, 0.0, 0.3), foot(0.05, 0.0, 0.24), foot(2.0, 0.0, 0.0)]
+    torch.testing.assert_close(ahead.low_feet(torch.stack(feet, 1)), torch.zeros(N), atol=1e-6, rtol=0.0)
+    ahead.place(EVERYONE, simulator, told("trot"))
+    assert not bool(ahead.low_feet(torch.stack([foot(0.05, 0.0, 0.0)] * 4, 1)).any()), "ramps are walked on"
+
+
+def test_critics_are_told_what_lies_where(simulator: Simulator) -> None:
+    stand(simulator, torch.zeros(N, 2), torch.zeros(N))
+    ahead = encounters(boxes=1.0)
+    ahead.place(EVERYONE, simulator, told("jump"))
+    way = torch.stack((ahead.yaw.cos(), ahead.yaw.sin()), -1)
+    left = torch.stack((-way[:, 1], way[:, 0]), -1)
+    stand(simulator, ahead.position - 1.5 * way + 0.4 * left, ahead.yaw + 0.1)
+    wanted = torch.tensor([0.0, 0.0, 1.0, 0.0, -1.5, 0.4, math.sin(0.1)]).repeat(N, 1)
+    wanted[:, 3] = ahead.lift
+    torch.testing.assert_close(ahead.observe(simulator), wanted)
+    stand(simulator, ahead.position - 4.5 * way, ahead.yaw)
+    assert torch.all(ahead.observe(simulator)[:, 4] == -3.0), "farther than anybody should care"
+    ahead.place(EVERYONE, simulator, told("trot", 1.0))
+    assert not bool(ahead.observe(simulator).any())
 
 
 def test_nothing_moves_under_a_robot_and_what_lies_behind_comes_again(simulator: Simulator) -> None:
@@ -258,6 +301,8 @@ def test_another_world_is_refused_with_them_only() -> None:
         options = {"num_threads": 1, **world}
         with pytest.raises(ValueError, match="encounters need a plane, and a simulator that holds"):
             LocomotionEnv(2, simulator_options=options, encounters=0.5)
+        with pytest.raises(ValueError, match="encounters need a plane, and a simulator that holds"):
+            LocomotionEnv(2, simulator_options=options, boxes=0.5)
         env = LocomotionEnv(2, simulator_options=options)
         env.rollout(2)
         env.close()
