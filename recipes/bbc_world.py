@@ -48,7 +48,7 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
     patterns = None
     if cfg.env.rhythm_weight:
         patterns = stride_patterns(dataset.labelled_clips, {"walk": cfg.env.walk_growth})
-    return LocomotionEnv(
+    env = LocomotionEnv(
         cfg.env.num_robots,
         simulator_options={**simulator_options(cfg, cfg.env.num_threads), **model, "terrain": terrain},
         reference=reference,
@@ -66,6 +66,14 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
         motion_offsets=cfg.motion.offsets,
         seed=seeds.integer("environment"),
     )
+    set_boxes(env, cfg.env)
+    return env
+
+
+def set_boxes(env: LocomotionEnv, cfg: EnvConfig) -> None:
+    """Let boxes that are put in the way from now on be as high as the options say."""
+    if env.encounters is not None:
+        env.encounters.box_height = (cfg.lowest_box, cfg.highest_box)
 
 
 def rewards(cfg: EnvConfig) -> dict[str, RewardTerm]:

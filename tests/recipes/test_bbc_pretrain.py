@@ -176,10 +176,10 @@ def test_a_truncated_checkpoint_is_refused_and_left_alone(tmp_path: Path, comman
 
 
 def test_options_change_at_their_iterations(module: Callable[[str], ModuleType]) -> None:
-    config = module("bbc_config")
+    config, changes = module("bbc_config"), module("bbc_changes")
     cfg = config.Config(changes=((2, "ppo.entropy", 0.1), (4, "ppo.entropy", 0.2), (3, "env.jump-weight", 9.0)))
-    assert [config.at(cfg, iteration).ppo.entropy for iteration in range(6)] == [0.01, 0.01, 0.1, 0.1, 0.2, 0.2]
-    assert [config.at(cfg, iteration).env.jump_weight for iteration in (2, 3)] == [6.0, 9.0]
+    assert [changes.at(cfg, iteration).ppo.entropy for iteration in range(6)] == [0.01, 0.01, 0.1, 0.1, 0.2, 0.2]
+    assert [changes.at(cfg, iteration).env.jump_weight for iteration in (2, 3)] == [6.0, 9.0]
 
 
 @pytest.mark.parametrize(
