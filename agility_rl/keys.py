@@ -34,6 +34,10 @@ COMMAND = "command"
 PEAK = "peak"
 """float32 ``[*B, 1]``, highest trunk position [m] of the last 0.9 s while jumping, else 0."""
 
+ENCOUNTER = "encounter"
+"""float32 ``[*B, 7]``, what lies in the way: one-hot bar, ramp, box; its height, the robot's place along and across it
+[m], and the sine of the robot's heading to it. For critics only: no robot sees it."""
+
 MOTION = "motion"
 """float32 ``[*B, H, F]``, consecutive discriminator frames, oldest first."""
 

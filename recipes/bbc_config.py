@@ -3,14 +3,13 @@ the number, and the released code's values where those are silent."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from hardware import HardwareConfig
 
-from agility_rl.behaviours import BEHAVIOURS, RESAMPLE_PERIOD
+from agility_rl.behaviours import RESAMPLE_PERIOD
 from agility_rl.motion.stride_patterns import FREQUENCY_GROWTH
 from agility_rl.training.precision import Precision
 
@@ -48,6 +47,16 @@ class EnvConfig:
     ridges: the largest; strips have all of it, half of it or none."""
     encounters: float = 0.0
     """Share of the commands on which a bar (before canter and jump) or a ramp lies in the way (ours)."""
+    boxes: float = 0.0
+    """Share of the jumps that begin before a box (ours)."""
+    lowest_box: float = 0.10
+    """Height of the lowest box [m]."""
+    highest_box: float = 0.30
+    """Height of the highest one [m]."""
+    low_feet_weight: float = 0.0
+    """Weight of a penalty for feet that come to a box lower than its top (ours) [1/m]."""
+    shares: tuple[float, ...] = ()
+    """How often each of the five behaviours is commanded, in place of the prior (ours)."""
     randomize: bool = True
     push_interval: float | None = 8.0
     """Seconds (released code)."""
@@ -173,6 +182,8 @@ class ImitationConfig:
     anchor: float = 0.0
     """Weight of staying near the policy of ``--init-from`` (squared distance of the mean actions): PPO then mends falls
     and leaves good gaits alone, which a discriminator that starts anew would not."""
+    anchor_jump: float = 1.0
+    """Factor on the anchor while a jump is commanded: a start that has never seen a box is no example before one."""
     anchor_turn_rate: float | None = None
     """Commanded turn rate [rad/s] beyond which the anchor lets go: a start that goes straight is no example there."""
     warm_up: int = 0
@@ -253,42 +264,3 @@ class Config(HardwareConfig):
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     adaptation: AdaptationConfig = field(default_factory=AdaptationConfig)
     trials: TrialsConfig = field(default_factory=TrialsConfig)
-
-
-CHANGEABLE: tuple[str, ...] = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight", "env.progress_left")
-CHANGEABLE += ("env.standing_starts", "env.canter_stance", "env.walk_emphasis")
-CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
-"""Options that may change during a run."""
-
-
-def check(cfg: Config) -> None:
-    """Refuse changes of options that cannot change, behaviours that do not exist, values that mean nothing.
-
-    Raises:
-        ValueError: naming the option and what can stand there.
-    """
-    if unknown := sorted(set(cfg.ppo.symmetric) - set(BEHAVIOURS)):
-        raise ValueError(f"--ppo.symmetric: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
-    for name, least, most, expected in (
-        ("standing_starts", 0.0, 1.0, "a share from 0 to 1"),
-        ("canter_stance", -1.0, 1.0, "a share of time"),
-        ("walk_emphasis", 0.0, math.inf, "a factor of at least 0"),
-    ):
-        later = [value for _, option, value in cfg.changes if option.replace("-", "_") == f"env.{name}"]
-        if bad := [value for value in (getattr(cfg.env, name), *later) if not least <= value <= most]:
-            raise ValueError(f"--env.{name.replace('_', '-')}: expected {expected}, got {bad[0]}")
-    for name, least in (("start", 1), ("every", 1), ("episodes", 1), ("seconds", 2), ("switches", 0)):
-        if (value := getattr(cfg.trials, name)) is not None and value < least:
-            raise ValueError(f"--trials.{name}: expected at least {least}, got {value}")
-    for _, option, _ in cfg.changes:
-        if option.replace("-", "_") not in CHANGEABLE:
-            raise ValueError(f"--changes: {option} cannot change in a run, only {', '.join(CHANGEABLE)} can")
-
-
-def at(cfg: Config, iteration: int) -> Config:
-    """The configuration with the changes that hold at an iteration; of two, the one further behind."""
-    for start, option, value in cfg.changes:
-        if iteration >= start:
-            section, name = option.replace("-", "_").split(".")
-            cfg = replace(cfg, **{section: replace(getattr(cfg, section), **{name: value})})
-    return cfg

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from agility_rl import keys
-from agility_rl.behaviours import COMMANDS
+from agility_rl.behaviours import COMMANDS, JUMP
 from agility_rl.envs.mirror import mirror
 from agility_rl.go2.mirror import mirror_joints
 
@@ -23,11 +23,12 @@ def hold(parts: Components, batch: TensorDictBase) -> None:
     batch[ANCHORED] = flat["loc"].unflatten(0, batch.batch_size)
 
 
-def distance_to_anchor(parts: Components, sample: TensorDictBase, turn_rate: float | None) -> Tensor:
+def distance_to_anchor(parts: Components, sample: TensorDictBase, turn_rate: float | None, jump: float = 1.0) -> Tensor:
     """Mean squared difference between the mean actions of policy and anchor [action units squared]; zero where a faster
-    turn than ``turn_rate`` [rad/s] is commanded."""
+    turn than ``turn_rate`` [rad/s] is commanded, ``jump`` times as much where a jump is."""
     policy = parts.bbc.trained_actor()[:-1]
     error = (policy(sample.select(*policy.in_keys))["loc"] - sample[ANCHORED]).square().mean(-1)
+    error = torch.where(sample[keys.SKILL] == JUMP, jump * error, error)
     if turn_rate is not None:
         error = error * (sample[keys.COMMAND][:, COMMANDS.index("yaw_rate")].abs() <= turn_rate)
     return error.mean()

@@ -21,12 +21,14 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from bbc_changes import at, check
 from bbc_cloning import clone_behaviour
-from bbc_config import Config, ImitationConfig, at, check
+from bbc_config import Config, ImitationConfig
 from bbc_penalties import asymmetry, distance_to_anchor, hold
 from bbc_presets import PRESETS
 from bbc_setup import Components, build, save_policy
 from bbc_trials import due, hold_trial, show_best
+from bbc_world import set_boxes
 from held_fixed import fit, infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -219,7 +221,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         parts.env.rhythm.longer_stance[BEHAVIOURS.index("canter")] = cfg.env.canter_stance
         parts.env.rhythm.emphasis[BEHAVIOURS.index("walk")] = cfg.env.walk_emphasis
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
-    parts.env.set_skill_probabilities(parts.prior.sampling_probabilities)
+    set_boxes(parts.env, cfg.env)
+    shares = torch.tensor(cfg.env.shares) if cfg.env.shares else parts.prior.sampling_probabilities
+    parts.env.set_skill_probabilities(shares)
     if parts.env.randomization is not None:
         delay = cfg.env.action_delay if iteration >= cfg.env.action_delay_from else 0.0
         parts.env.randomization = replace(parts.env.randomization, action_delay=(delay, delay))
@@ -252,7 +256,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
             if kept > 0.0:
                 loss = loss + kept * parts.demonstrations.error(parts.bbc)
             if parts.anchor is not None:
-                away = distance_to_anchor(parts, sample, cfg.imitation.anchor_turn_rate)
+                away = distance_to_anchor(parts, sample, cfg.imitation.anchor_turn_rate, cfg.imitation.anchor_jump)
                 loss = loss + cfg.imitation.anchor * away
             if cfg.ppo.symmetry:
                 loss = loss + cfg.ppo.symmetry * asymmetry(parts, sample, symmetric)

@@ -108,6 +108,9 @@ def build(cfg: Config) -> Components:
         Artifact.load(cfg.init_from, kind="bbc").fill(anchor)
     critic_keys = [keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.COMMAND, keys.PEAK]
     critic_keys += [keys.HISTORY] if ppo.critic_history else []
+    critic_keys += (
+        [keys.ENCOUNTER] if env.encounters is not None else []
+    )  # else its every judgement waits for the stumble
     width = sum(env.observation_spec[key].shape[1:].numel() for key in critic_keys)
     critic = Critic(width, in_keys=critic_keys, hidden=ppo.hidden).to(device)
     mean, deviation = dataset.statistics()
@@ -163,6 +166,7 @@ def build(cfg: Config) -> Components:
                 keys.HISTORY,
             ),
             *(keys.SKILL, keys.SHIFT, keys.ACTION, "action_log_prob", "loc", "scale"),
+            *([keys.ENCOUNTER] if env.encounters is not None else []),
         ],
         keep_next=["reward", keys.MOTION, keys.REWARD_TERMS],
         value=lambda observation: critic(observation.select(*critic_keys))["state_value"],

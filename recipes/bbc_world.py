@@ -20,6 +20,7 @@ from agility_rl.envs.rewards import (
     jump_height_peak,
     jump_height_window,
     lateral_progress,
+    low_feet,
     rhythm,
     turn_progress,
     velocity_progress,
@@ -47,7 +48,7 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
     patterns = None
     if cfg.env.rhythm_weight:
         patterns = stride_patterns(dataset.labelled_clips, {"walk": cfg.env.walk_growth})
-    return LocomotionEnv(
+    env = LocomotionEnv(
         cfg.env.num_robots,
         simulator_options={**simulator_options(cfg, cfg.env.num_threads), **model, "terrain": terrain},
         reference=reference,
@@ -61,9 +62,18 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
         resample_period=cfg.env.resample_period,
         patterns=patterns,
         encounters=cfg.env.encounters,
+        boxes=cfg.env.boxes,
         motion_offsets=cfg.motion.offsets,
         seed=seeds.integer("environment"),
     )
+    set_boxes(env, cfg.env)
+    return env
+
+
+def set_boxes(env: LocomotionEnv, cfg: EnvConfig) -> None:
+    """Let boxes that are put in the way from now on be as high as the options say."""
+    if env.encounters is not None:
+        env.encounters.box_height = (cfg.lowest_box, cfg.highest_box)
 
 
 def rewards(cfg: EnvConfig) -> dict[str, RewardTerm]:
@@ -79,6 +89,8 @@ def rewards(cfg: EnvConfig) -> dict[str, RewardTerm]:
         terms["lateral_progress"] = RewardTerm(cfg.lateral_weight, lateral_progress)
     if cfg.rhythm_weight:
         terms["rhythm"] = RewardTerm(cfg.rhythm_weight, rhythm)
+    if cfg.low_feet_weight:
+        terms["low_feet"] = RewardTerm(-cfg.low_feet_weight, low_feet)
     terms["collision"] = terms["collision"]._replace(weight=cfg.collision_weight)
     return terms
 

@@ -55,9 +55,10 @@ LEAPS: dict[str, Passage] = {
     **PASSAGES,
     "bar_jump": Passage(-1.25, "jump", 1.8, 0.3),
     "tire_jump": Passage(-1.25, "jump", 1.8, 0.15),
+    "box_jump": Passage(-1.75, "jump", 1.7, 0.3),
 }
-"""Over hurdles by a leap out of a trot, for controllers whose jump passes them (docs/agility.md, "A guide, and
-leaps")."""
+"""Over hurdles and onto boxes by a leap out of a trot, for controllers whose jump passes them (docs/agility.md,
+"A guide, and leaps")."""
 USUAL = "trot"
 """Behaviour between obstacles."""
 CRUISE, SLOW = 1.0, 0.5

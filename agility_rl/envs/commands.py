@@ -69,11 +69,12 @@ class CommandSampler:
         self.shift = torch.where(mask[:, None], shift, self.shift)
         self.age = self.age.masked_fill(mask, 0)
 
-    def advance(self) -> None:
-        """Let one control step pass and redraw what has become too old."""
+    def advance(self, held: Tensor | None = None) -> None:
+        """Let one control step pass and redraw what has become too old, but not the rows of a bool mask ``[N]``."""
         self.age = self.age + 1
         if self.period is not None:
-            self.resample(self.age >= self.period)
+            old = self.age >= self.period
+            self.resample(old if held is None else old & ~held)
 
     def vector(self) -> Tensor:
         """Command observation ``[N, 11]``: five commands, shift, one-hot skill (:data:`agility_rl.keys.COMMAND`)."""

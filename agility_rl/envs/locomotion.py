@@ -13,13 +13,14 @@ from torchrl.envs import EnvBase
 
 from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.commands import CommandSampler
-from agility_rl.envs.encounters import PIECES, Encounters
+from agility_rl.envs.encounters import NUM_OBSERVED, PIECES, Encounters
 from agility_rl.envs.observations import ObservationGroups
 from agility_rl.envs.randomization import Randomization, uniform
 from agility_rl.envs.reference import ReferenceStates
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm
 from agility_rl.envs.rhythm import Rhythm
 from agility_rl.envs.robots import CLEARANCE, Pushes, Robots
+from agility_rl.envs.state import LocomotionState
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, Termination
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator, make_simulator
@@ -40,9 +41,9 @@ class LocomotionEnv(EnvBase):
     Source: method notes, section 4; supplement S2, S4, Table S2.
 
     Keys written (``N`` robots): ``proprioception`` [N, 45], ``explicit`` [N, 4], ``privileged`` [N, 29], ``history``
-    [N, 10, 45], ``command`` [N, 11], ``peak`` [N, 1], ``motion`` [N, 2, 49], ``skill`` [N], ``shift`` [N, 1],
-    ``reward`` [N, 1], ``(reward_terms, name)`` [N, 1], ``done``, ``terminated``, ``truncated`` [N, 1]. Units stand in
-    :mod:`agility_rl.keys`.
+    [N, 10, 45], ``command`` [N, 11], ``peak`` [N, 1], ``motion`` [N, 2, 49], ``skill`` [N], ``shift`` [N, 1], with
+    encounters ``encounter`` [N, 7], ``reward`` [N, 1], ``(reward_terms, name)`` [N, 1], ``done``, ``terminated``,
+    ``truncated`` [N, 1]. Units stand in :mod:`agility_rl.keys`.
 
     Args:
         num_robots: N.
@@ -63,6 +64,7 @@ class LocomotionEnv(EnvBase):
         patterns: rhythm of each behaviour, as :class:`agility_rl.envs.rhythm.Rhythm` takes them, for the reward term
             ``rhythm``; ``None`` hears none.
         encounters: share of the commands on which a bar or a ramp lies in the way (:class:`Encounters`).
+        boxes: share of the jumps that begin before a box.
         motion_offsets: which discriminator frames ``motion`` holds, in control steps from the oldest; ``[N, H, 49]``
             then has their number H. With ``past_motion`` in the reference, those before an episode are the dog's.
         seed: seed of all randomness in the environment.
@@ -98,17 +100,19 @@ class LocomotionEnv(EnvBase):
         push_velocity: float = 0.5,
         patterns: TensorDictBase | None = None,
         encounters: float = 0.0,
+        boxes: float = 0.0,
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
         seed: int = 0,
     ) -> None:
-        engine = {"scenery": PIECES if encounters else (), **(simulator_options or {})}
+        meeting = bool(encounters or boxes)
+        engine = {"scenery": PIECES if meeting else (), **(simulator_options or {})}
         simulator = simulator or make_simulator(num_simulations=num_robots, **engine)
         super().__init__(device=simulator.device, batch_size=torch.Size([num_robots]))
         self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
         self.simulator, device = simulator, simulator.device
         if self.simulator.num_simulations != num_robots:
             raise ValueError(f"the simulator holds {self.simulator.num_simulations} robots, expected {num_robots}")
-        if encounters and (tuple(simulator.scenery) != PIECES or simulator.ground_extent > 0.0):
+        if meeting and (tuple(simulator.scenery) != PIECES or simulator.ground_extent > 0.0):
             raise ValueError("encounters need a plane, and a simulator that holds agility_rl.envs.encounters.PIECES")
         self.dt = self.simulator.control_dt
         self.rewards = dict(rewards)
@@ -131,7 +135,7 @@ class LocomotionEnv(EnvBase):
         n = num_robots
         interval = None if push_interval is None else round(push_interval / self.dt)
         self.pushes = Pushes(n, self.generator, interval, push_velocity)
-        self.encounters = Encounters(n, self.generator, encounters) if encounters else None
+        self.encounters = Encounters(n, self.generator, encounters, boxes) if meeting else None
         self.robots = Robots(self.simulator, self.generator, self._ground)
         self.rhythm = None if patterns is None else Rhythm(n, patterns.to(device))
         self._step_count = torch.zeros(n, dtype=torch.int64, device=device)
@@ -152,6 +156,7 @@ class LocomotionEnv(EnvBase):
                 keys.MOTION: group(len(self.observations.motion_offsets), features.NUM_MOTION),
                 keys.SKILL: Categorical(behaviours.NUM_BEHAVIOURS, shape=(n,), dtype=torch.int64),
                 keys.SHIFT: Bounded(-1.0, 1.0, (n, 1), dtype=torch.float32),
+                **({} if self.encounters is None else {keys.ENCOUNTER: group(NUM_OBSERVED)}),
                 keys.REWARD_TERMS: Composite({name: group(1) for name in self.rewards}, shape=(n,)),
             },
             shape=(n,),
@@ -198,7 +203,7 @@ class LocomotionEnv(EnvBase):
             self.commands.resample(mask)
         past = self._place(mask)
         if self.encounters is not None:
-            self.encounters.place(mask, self.simulator, self.commands)
+            self.encounters.begin(mask, self.simulator, self.commands)
         if self.randomization is not None:
             self.robots.randomize(mask, self.randomization)
         self._step_count = self._step_count.masked_fill(mask, 0)
@@ -208,7 +213,7 @@ class LocomotionEnv(EnvBase):
         state = self.robots.begin(mask, self.commands)
         self.observations.reset(mask, state, past)
 
-        observation = self.observations.build(state, self.commands, self.robots.privileged)
+        observation = self._observe(state)
         nothing = {name: torch.zeros(self.num_robots, 1, device=self.device) for name in self.rewards}
         observation[keys.REWARD_TERMS] = TensorDict(nothing, self.batch_size)
         for name in ("done", "terminated", "truncated"):
@@ -224,23 +229,33 @@ class LocomotionEnv(EnvBase):
         state = self.robots.state(action, self.commands)
         if self.rhythm is not None:
             state.rhythm = self.rhythm.update(state, self.commands.skill)
+        if self.encounters is not None:
+            feet = rotations.rotate(self.simulator.root_quaternion[:, None], state.feet)
+            state.low_feet = self.encounters.low_feet(feet + self.simulator.root_position[:, None])
         terms = torch.stack([term.weight * self.dt * term.function(state) for term in self.rewards.values()], -1)
         terms = terms.masked_fill(state.unstable[:, None], 0.0)
         reward = terms.sum(-1, keepdim=True).clamp(min=0.0)
         terminated = torch.stack([failed(state) for failed in self.terminations]).any(0)[:, None]
         truncated = ((self._step_count >= self.max_steps) | self._at_edge())[:, None] & ~terminated
 
-        self.commands.advance()
+        held = None if self.encounters is None else self.encounters.holding(self.simulator, self.commands)
+        self.commands.advance(held)
         if self.encounters is not None:
             self.encounters.advance(self.simulator, self.commands)
         self.observations.update(state)
         self.robots.remember(state)
-        observation = self.observations.build(state, self.commands, self.robots.privileged)
+        observation = self._observe(state)
         observation["reward"] = reward
         observation["terminated"], observation["truncated"] = terminated, truncated
         observation["done"] = terminated | truncated
         by_name = dict(zip(self.rewards, terms.split(1, -1), strict=True))
         observation[keys.REWARD_TERMS] = TensorDict(by_name, self.batch_size)
+        return observation
+
+    def _observe(self, state: LocomotionState) -> TensorDict:
+        observation = self.observations.build(state, self.commands, self.robots.privileged)
+        if self.encounters is not None:
+            observation[keys.ENCOUNTER] = self.encounters.observe(self.simulator)
         return observation
 
     # -- physics -----------------------------------------------------------------------------------------------------

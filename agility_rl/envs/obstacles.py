@@ -331,8 +331,16 @@ BOX_HALF = (0.8, 0.6, 0.25)
 """Half extents [m] (ours): long enough to land on; the supplement (Fig. S3) only says that it is 30 cm high."""
 
 
+def box_shape(half_width: float) -> Shape:
+    """A block whose top is at the height to which its piece is lifted.
+
+    Args:
+        half_width: half of its width, across the way [m].
+    """
+    return Shape("box", (BOX_HALF[0], half_width, BOX_HALF[2]), (0.0, 0.0, -BOX_HALF[2]), colour=_BLUE)
+
+
 def _box_jump() -> Obstacle:
-    block = Shape("box", BOX_HALF, (0.0, 0.0, -BOX_HALF[2]), colour=_BLUE)
 
     def profile(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         on = (x.abs() <= BOX_HALF[0]) & (y.abs() <= BOX_HALF[1])
@@ -340,7 +348,7 @@ def _box_jump() -> Obstacle:
 
     return Obstacle(
         "box_jump",
-        (Piece("box", (block,)),),
+        (Piece("box", (box_shape(BOX_HALF[1]),)),),
         ((-2.0, 0.0), (-1.2, 0.0), (0.0, 0.0), (0.4, 0.0)),  # ours: done when standing on it
         BOX_HALF[:2],
         profile,

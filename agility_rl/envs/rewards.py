@@ -92,6 +92,14 @@ def rhythm(state: LocomotionState) -> Tensor:
     return state.rhythm
 
 
+def low_feet(state: LocomotionState) -> Tensor:
+    """By how much the feet that come to a box are lower than its top, of all together [m].
+
+    Ours: whether a robot gets onto a box is settled half a second before it falls, when its feet come to the edge.
+    """
+    return state.low_feet
+
+
 def jump_height_window(state: LocomotionState) -> Tensor:
     """10 while jumping and within 5 cm of the commanded height (released code)."""
     near = (state.command[:, 3] - state.root_height[:, 0]).abs() < 0.05

@@ -142,6 +142,7 @@ class Robots:
             jumping=commands.jumping,
             peak_height=self.heights.amax(-1),
             rhythm=torch.zeros_like(roll),
+            low_feet=torch.zeros_like(roll),
             unstable=simulator.unstable,
             dt=self.dt,
         )

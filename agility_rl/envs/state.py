@@ -39,6 +39,7 @@ class LocomotionState:
         jumping: bool ``[N]``, the skill is jump.
         peak_height: ``[N]`` highest trunk of the last 0.9 s [m].
         rhythm: ``[N]`` how much of the feet's motion follows the commanded pattern, times its emphasis (0 without).
+        low_feet: ``[N]`` by how much feet that come to a box are lower than its top, all together [m] (0 without).
         unstable: bool ``[N]``, the engine reported divergence.
         dt: control step [s].
     """
@@ -67,6 +68,7 @@ class LocomotionState:
     jumping: Tensor
     peak_height: Tensor
     rhythm: Tensor
+    low_feet: Tensor
     unstable: Tensor
     dt: float
 

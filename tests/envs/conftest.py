@@ -54,6 +54,7 @@ def neutral() -> Callable[..., LocomotionState]:
             "command": torch.zeros(n, 5),
             "jumping": torch.zeros(n, dtype=torch.bool),
             "rhythm": torch.zeros(n),
+            "low_feet": torch.zeros(n),
             "unstable": torch.zeros(n, dtype=torch.bool),
             "dt": 0.02,
         }

@@ -70,6 +70,17 @@ def test_clocks_redraw_each_row_at_its_own_time(sampler: CommandSampler) -> None
     assert (sampler.command != first).any(-1)[half].float().mean() > 0.99
 
 
+def test_who_is_held_is_told_the_same_until_let_go(sampler: CommandSampler) -> None:
+    held, first = torch.arange(N) < N // 2, sampler.command
+    for _ in range(5):
+        sampler.advance(held)
+    changed = (sampler.command != first).any(-1)
+    assert not changed[held].any() and changed[~held].float().mean() > 0.99
+    assert sampler.age.tolist() == [5] * (N // 2) + [2] * (N // 2)
+    sampler.advance()
+    assert (sampler.command != first).any(-1).float().mean() > 0.99 and not sampler.age.any()
+
+
 def test_without_a_period_nothing_is_redrawn(generator: torch.Generator) -> None:
     sampler = CommandSampler(2, generator, period=None)
     sampler.assign(torch.tensor([True, True]), torch.tensor([1, 4]), torch.ones(2, 5), torch.zeros(2, 1))

@@ -31,6 +31,7 @@ EVERYTHING: dict[str, Any] = {
     "rewards": {**LOCOMOTION_REWARDS, "rhythm": RewardTerm(1.0, rhythm)},
     "patterns": stride_patterns([synthesize_gait(name) for name in BEHAVIOURS]),
     "encounters": 0.8,
+    "boxes": 0.5,
 }
 """All randomness there is, often."""
 

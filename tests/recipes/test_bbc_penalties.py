@@ -10,6 +10,7 @@ from types import ModuleType
 import pytest
 import torch
 
+from agility_rl.behaviours import JUMP
 from agility_rl.go2.mirror import mirror_joints
 
 Module = Callable[[str], ModuleType]
@@ -34,6 +35,9 @@ def test_an_anchor_holds_the_policy_to_the_one_it_started_from(module: Module, t
     straight = (batch["command"][:, 2].abs() <= 0.4).float().mean()
     assert 0.0 < straight < 1.0
     torch.testing.assert_close(penalties.distance_to_anchor(parts, batch, 0.4), 0.09 * straight)
+    jumping = (batch["skill"] == JUMP).float().mean()
+    assert 0.0 < jumping < 1.0
+    torch.testing.assert_close(penalties.distance_to_anchor(parts, batch, None, 0.5), 0.09 * (1.0 - 0.5 * jumping))
     distance.backward()
     assert all(parameter.grad is None for parameter in parts.anchor.parameters())
     assert any(parameter.grad is not None for parameter in parts.bbc.actor.parameters())

@@ -28,6 +28,7 @@ ONE_THREAD = os.environ | {"OMP_NUM_THREADS": "1"}
 Command = Callable[..., subprocess.CompletedProcess[str]]
 EVERYTHING = (
     *("--env.encounters", "0.8", "--env.resample-period", "0.2", "--env.lateral-weight", "2", "--ppo.symmetry", "1"),
+    *("--env.boxes", "0.5", "--env.shares", "1", "1", "1", "1", "2"),
     *("--env.rhythm-weight", "1.0", "--env.randomize", "--env.push-interval", "0.1", "--env.observation-noise", "1"),
     *("--env.action-delay", "0.01", "--env.action-delay-from", "5", "--env.progress-fade", "2", "4"),
     *("--imitation.information-ramp", "2", "4", "--adaptation.privileged-ramp", "3", "2", "--adaptation.every", "3"),
@@ -175,10 +176,10 @@ def test_a_truncated_checkpoint_is_refused_and_left_alone(tmp_path: Path, comman
 
 
 def test_options_change_at_their_iterations(module: Callable[[str], ModuleType]) -> None:
-    config = module("bbc_config")
+    config, changes = module("bbc_config"), module("bbc_changes")
     cfg = config.Config(changes=((2, "ppo.entropy", 0.1), (4, "ppo.entropy", 0.2), (3, "env.jump-weight", 9.0)))
-    assert [config.at(cfg, iteration).ppo.entropy for iteration in range(6)] == [0.01, 0.01, 0.1, 0.1, 0.2, 0.2]
-    assert [config.at(cfg, iteration).env.jump_weight for iteration in (2, 3)] == [6.0, 9.0]
+    assert [changes.at(cfg, iteration).ppo.entropy for iteration in range(6)] == [0.01, 0.01, 0.1, 0.1, 0.2, 0.2]
+    assert [changes.at(cfg, iteration).env.jump_weight for iteration in (2, 3)] == [6.0, 9.0]
 
 
 @pytest.mark.parametrize(
@@ -196,6 +197,9 @@ def test_options_change_at_their_iterations(module: Callable[[str], ModuleType])
         (("--env.walk-emphasis", "-1"), "--env.walk-emphasis: expected a factor of at least 0, got -1.0"),
         (("--trials.start", "1", "--trials.every", "0"), "--trials.every: expected at least 1, got 0"),
         (("--trials.seconds", "1.5"), "--trials.seconds: expected at least 2, got 1.5"),
+        (("--env.boxes", "-1"), "--env.boxes: expected a share from 0 to 1, got -1.0"),
+        (("--changes", "3", "env.highest-box", "2"), "--env.highest-box: expected a height of boxes [m], got 2.0"),
+        (("--env.shares", "1", "0"), "--env.shares: expected 5 numbers, none below 0, got (1.0, 0.0)"),
         (("--env.encounters", "1.5"), "encounters: expected a share from 0 to 1, got 1.5"),
     ],
 )

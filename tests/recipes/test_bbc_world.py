@@ -19,7 +19,8 @@ def test_only_rewards_with_a_weight_are_paid(module: Module) -> None:
     world, published = module("bbc_world"), module("bbc_config").EnvConfig()
     assert "turn_progress" not in (plain := world.rewards(published)) and "velocity_progress" not in plain
     assert plain["collision"].weight == -10.0  # supplement S4
-    assert "lateral_progress" not in plain
+    assert "lateral_progress" not in plain and "low_feet" not in plain
+    assert world.rewards(replace(published, low_feet_weight=6.0))["low_feet"].weight == -6.0
     weights = {"turn_weight": 3.0, "progress_weight": 2.0, "jump_weight": 5.0, "lateral_weight": 4.0}
     ours, names = world.rewards(replace(published, **weights)), ("turn", "velocity", "lateral")
     assert [ours[f"{name}_progress"].weight for name in names] == [3.0, 2.0, 4.0]

@@ -1,0 +1,56 @@
+"""Options of the training of a Basic Behaviour Controller: which may change during a run, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from bbc_config import Config
+
+from agility_rl.behaviours import BEHAVIOURS
+from agility_rl.envs.obstacles import BOX_HALF
+
+CHANGEABLE: tuple[str, ...] = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight", "env.progress_left")
+CHANGEABLE += ("env.lowest_box", "env.highest_box", "env.standing_starts", "env.canter_stance", "env.walk_emphasis")
+CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
+"""Options that may change during a run."""
+
+
+def check(cfg: Config) -> None:
+    """Refuse changes of options that cannot change, behaviours that do not exist, values that mean nothing.
+
+    Raises:
+        ValueError: naming the option and what can stand there.
+    """
+    if unknown := sorted(set(cfg.ppo.symmetric) - set(BEHAVIOURS)):
+        raise ValueError(f"--ppo.symmetric: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
+    for name, least, most, expected in (
+        ("standing_starts", 0.0, 1.0, "a share from 0 to 1"),
+        ("canter_stance", -1.0, 1.0, "a share of time"),
+        ("boxes", 0.0, 1.0, "a share from 0 to 1"),
+        ("lowest_box", 0.0, 2.0 * BOX_HALF[2], "a height of boxes [m]"),
+        ("highest_box", 0.0, 2.0 * BOX_HALF[2], "a height of boxes [m]"),
+        ("walk_emphasis", 0.0, math.inf, "a factor of at least 0"),
+    ):
+        later = [value for _, option, value in cfg.changes if option.replace("-", "_") == f"env.{name}"]
+        if bad := [value for value in (getattr(cfg.env, name), *later) if not least <= value <= most]:
+            raise ValueError(f"--env.{name.replace('_', '-')}: expected {expected}, got {bad[0]}")
+    if cfg.env.shares and (
+        len(cfg.env.shares) != len(BEHAVIOURS) or min(cfg.env.shares) < 0 or not sum(cfg.env.shares)
+    ):
+        raise ValueError(f"--env.shares: expected {len(BEHAVIOURS)} numbers, none below 0, got {cfg.env.shares}")
+    for name, least in (("start", 1), ("every", 1), ("episodes", 1), ("seconds", 2), ("switches", 0)):
+        if (value := getattr(cfg.trials, name)) is not None and value < least:
+            raise ValueError(f"--trials.{name}: expected at least {least}, got {value}")
+    for _, option, _ in cfg.changes:
+        if option.replace("-", "_") not in CHANGEABLE:
+            raise ValueError(f"--changes: {option} cannot change in a run, only {', '.join(CHANGEABLE)} can")
+
+
+def at(cfg: Config, iteration: int) -> Config:
+    """The configuration with the changes that hold at an iteration; of two, the one further behind."""
+    for start, option, value in cfg.changes:
+        if iteration >= start:
+            section, name = option.replace("-", "_").split(".")
+            cfg = replace(cfg, **{section: replace(getattr(cfg, section), **{name: value})})
+    return cfg
