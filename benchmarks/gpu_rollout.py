@@ -74,7 +74,7 @@ def contenders(parts: Any, steps: int) -> dict[str, Callable[[], object]]:
     env, robots = parts.env, parts.env.num_robots
     pose = torch.tensor(constants.DEFAULT_POSE, device=env.device)
     scale = torch.tensor(constants.ACTION_SCALE, device=env.device)
-    targets = pose + 0.05 * torch.randn(steps, robots, 12, device=env.device)
+    targets = pose + 0.05 * torch.randn(steps, robots, 12, generator=env.generator, device=env.device)
     bare = bare_step("warp", argparse.Namespace(robots=robots, device=str(env.device)))
     policy = parts.bbc.privileged_policy()
     env.reset()

@@ -30,7 +30,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     # A robot log is read from, and written to, the MCAP form of record; record knows no collector: no circle.
     "collectors": GROUND | {"go2", "simulation", "envs", "record"},
     "deploy": GROUND | {"go2", "modules"},
-    "training": set(),
+    "training": {"tensors"},
     "record": GROUND | {"go2"},
 }
 """For each part of the package, the other parts that it may import (the part "" is ``agility_rl/__init__.py``)."""
