@@ -85,7 +85,8 @@ def collect(cfg: Config) -> TensorDictBase:
     parts = build(run, trained)
     load_student(parts, cfg.student, frozen_parts(run))
     parts.collector.led = round(cfg.led * cfg.num_robots)
-    rows, start = [], time.monotonic()
+    rows: list[TensorDictBase] = []
+    start = time.monotonic()
     while len(rows) < cfg.windows and (not rows or time.monotonic() - start < 60.0 * cfg.minutes):
         set_course(parts.env, parts.curriculum)
         window = parts.collector.collect()
