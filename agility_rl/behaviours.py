@@ -6,7 +6,8 @@ Source: Fu et al. 2025, Table S2 (ranges) and section S2 (redraw period); dead-b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -49,6 +50,11 @@ COMMAND_RANGES: dict[str, CommandRange] = {
 }
 """Command ranges of the quadrupedal agility challenge (Table S2)."""
 
+FASTEST_CANTER = COMMAND_RANGES["canter"].velocity_x[1]
+"""Fastest canter that is commanded [m/s] (Table S2), where nobody asks for a faster one."""
+TOP_SPEED = 5.0
+"""Nobody may ask for more [m/s]: no Go2 is as fast (manufacturer's data)."""
+
 
 def skill_index(name: str) -> int:
     """Index of a behaviour.
@@ -66,23 +72,41 @@ def skill_index(name: str) -> int:
         raise ValueError(f"{name!r} is no behaviour; expected one of {', '.join(BEHAVIOURS)}") from None
 
 
-_BOUNDS = tuple(
-    tuple(tuple((getattr(row, command) or (0.0, 0.0))[end] for command in COMMANDS) for row in COMMAND_RANGES.values())
-    for end in (0, 1)
-)
+@functools.cache
+def _bounds(fastest_canter: float) -> tuple[tuple[tuple[float, ...], ...], ...]:
+    """Lower and upper ends of :data:`COMMAND_RANGES`, but for the canter's forward speed."""
+    slowest = COMMAND_RANGES["canter"].velocity_x[0]
+    if not slowest < fastest_canter <= TOP_SPEED:
+        raise ValueError(
+            f"fastest canter: expected more than {slowest:g} and at most {TOP_SPEED:g} m/s, got {fastest_canter}"
+        )
+    ranges = COMMAND_RANGES | {"canter": replace(COMMAND_RANGES["canter"], velocity_x=(slowest, fastest_canter))}
+    return tuple(
+        tuple(tuple((getattr(row, command) or (0.0, 0.0))[end] for command in COMMANDS) for row in ranges.values())
+        for end in (0, 1)
+    )
 
 
-def command_bounds(device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+def command_bounds(device: torch.device | str = "cpu", fastest_canter: float = FASTEST_CANTER) -> tuple[Tensor, Tensor]:
     """Lower and upper bound of every command, each ``[5 behaviours, 5 commands]``; unused commands are 0.
 
     They are shared (:func:`agility_rl.tensors.constant`): never change them in place.
+
+    Source: Table S2; a faster canter is ours.
+
+    Args:
+        device: where they are.
+        fastest_canter: upper bound of the canter's forward speed [m/s].
+
+    Raises:
+        ValueError: if there is no such canter.
 
     Example:
         >>> low, high = command_bounds()
         >>> round(high[skill_index("canter"), 0].item(), 3)
         2.0
     """
-    low, high = _BOUNDS
+    low, high = _bounds(fastest_canter)
     return constant(low, torch.device(device)), constant(high, torch.device(device))
 
 
@@ -108,7 +132,9 @@ def sample_commands(skill: Tensor, generator: torch.Generator | None = None) -> 
     return command.masked_fill(command.abs() < constant(DEAD_BAND, skill.device), 0.0)
 
 
-def commands_from_parameters(skill: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
+def commands_from_parameters(
+    skill: Tensor, parameters: Tensor, bounds: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
     """Map parameters in [-1, 1] to the command range of each given skill.
 
     Source: the Task-Specific Controller's action, method notes, section 5.1; ranges: Table S2.
@@ -116,6 +142,7 @@ def commands_from_parameters(skill: Tensor, parameters: Tensor) -> tuple[Tensor,
     Args:
         skill: int64 ``[*B]``, index into :data:`BEHAVIOURS`.
         parameters: ``[*B, 6]``, the five commands in the order of :data:`COMMANDS` and the shift; clipped.
+        bounds: of all commands (:func:`command_bounds`); Table S2's by default.
 
     Returns:
         Commands ``[*B, 5]`` in the units of :data:`COMMANDS`, unused ones zero, and the shift ``[*B, 1]`` as it is.
@@ -125,7 +152,7 @@ def commands_from_parameters(skill: Tensor, parameters: Tensor) -> tuple[Tensor,
         >>> [round(number, 3) for number in command[0].tolist()]  # the middle of a trot
         [1.0, 0.0, 0.0, 0.0, 0.295]
     """
-    low, high = command_bounds(skill.device)
+    low, high = command_bounds(skill.device) if bounds is None else bounds
     parameters = parameters.clamp(-1.0, 1.0)
     command = low[skill] + (high - low)[skill] * (parameters[..., : len(COMMANDS)] + 1.0) / 2.0
     return command, parameters[..., len(COMMANDS) :]

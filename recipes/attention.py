@@ -123,8 +123,8 @@ def attend(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError(f"--obstacle: unknown {config.obstacle!r}; expected one of {', '.join(OBSTACLES)}")
     disturbances, course = chosen(DISTURBED, config.strength), course_of(config.course)
     deciders = [load_decider(path, config.bbc, kind="student") for path in config.runs]
-    if len({(one.manifest["bbc"], one.decision_steps) for one in deciders}) > 1:
-        raise ValueError("the students must belong to the same BBC and decide at the same rate")
+    if len({(one.manifest["bbc"], one.decision_steps, one.fastest_canter) for one in deciders}) > 1:
+        raise ValueError("the students must belong to the same BBC, decide at the same rate and canter as fast")
     scenes = collect_scenes(
         course,
         deciders,

@@ -96,6 +96,7 @@ def collect_scenes(
         simulator_options={"num_threads": num_threads, "friction_loss": first.controller.friction_loss},
         decision_steps=first.decision_steps,
         command_noise=(1.0, 1.0),
+        fastest_canter=first.fastest_canter,
         seed=seed,
     )
     eye = env.simulator.make_camera()

@@ -17,6 +17,7 @@ from tsc_config import Config as TeacherConfig
 from tsc_script import read
 
 from agility_rl import behaviours, keys
+from agility_rl.behaviours import FASTEST_CANTER
 from agility_rl.envs import AgilityEnv
 from agility_rl.envs.depth import DepthObservation
 from agility_rl.modules import RecurrentStudent
@@ -94,6 +95,8 @@ class Decider:
     """The network, when it is one that looks and remembers."""
     manifest: Mapping[str, Any] = field(default_factory=dict)
     """Of its artifact."""
+    fastest_canter: float = FASTEST_CANTER
+    """What the forward speed of its canters ends at [m/s]."""
 
     @property
     def kind(self) -> str:
@@ -138,24 +141,36 @@ def load_decider(
         tuple(behaviours.BEHAVIOURS[index] for index in trained.allowed),
         student,
         trained.artifact.manifest,
+        trained.fastest_canter,
     )
 
 
-def load_script(text: str, bbc: Path | None) -> Decider:
+def load_script(text: str, bbc: Path | None, fastest_canter: float = FASTEST_CANTER) -> Decider:
     """What a script decides.
 
     Args:
         text: as :func:`tsc_script.read` reads it.
         bbc: folder of the controller; that of the teachers by default.
+        fastest_canter: that it may command [m/s].
 
     Raises:
-        ValueError: if it is no script.
+        ValueError: if it is no script, or there is no such canter.
     """
-    script = read(text)
+    script = read(text, fastest_canter=fastest_canter)
     if not script.complete:
         raise ValueError(
             f"--script: {text!r} leaves decisions to a teacher, and there is none; say what it does usually"
         )
     controller = load_controller(bbc or TeacherConfig().bbc)
     label = "script_" + text.replace(":", "_").replace(",", "_").replace("=", "_")
-    return Decider(script.decide, 1, controller, label, None, None, "full", script.behaviours)
+    return Decider(
+        script.decide,
+        1,
+        controller,
+        label,
+        None,
+        None,
+        "full",
+        script.behaviours,
+        fastest_canter=fastest_canter,
+    )

@@ -40,6 +40,7 @@ from rich.progress import Progress
 from torch import Tensor
 from tsc_setup import course_of, frozen
 
+from agility_rl.behaviours import FASTEST_CANTER
 from agility_rl.envs import AgilityEnv, Course
 from agility_rl.envs.agility import COURSE_RANDOMIZATION
 from agility_rl.envs.course_presets import CHALLENGE
@@ -68,6 +69,8 @@ class Config:
     """BEHAVIOUR:SPEED [m/s], such as trot:1.2, or trot:1.2,bar_jump=jump:1.4,... , in place of it; or ``guide`` or
     ``leap`` (over hurdles), which know in metres where robots stand; they may also decide for one obstacle:
     bar_jump=leap."""
+    fastest_canter: float | None = None
+    """Fastest canter that a script may command [m/s]; Table S2's by default. A teacher or student says itself."""
     bbc: Path | None = None
     """Folder of the Basic Behaviour Controller: that of the training by default, for a script that of the teachers."""
     course: tuple[str, ...] = ()
@@ -118,6 +121,7 @@ def simulate(
         simulator_options={"num_threads": config.num_threads, "friction_loss": decider.controller.friction_loss},
         decision_steps=1,
         command_noise=(1.0, 1.0),
+        fastest_canter=decider.fastest_canter,
         randomization=RANDOMIZATIONS[config.randomization],
         observation_noise=config.noise,
         episode_length=config.episode_length,
@@ -155,6 +159,8 @@ def check(config: Config) -> None:
         )
     if config.script is not None and config.behaviours is not None:
         raise ValueError("--behaviours limits a teacher or student; a script says itself which it chooses")
+    if config.run is not None and config.fastest_canter is not None:
+        raise ValueError("--fastest-canter is for a script; what a teacher or student commands was settled in training")
 
 
 def draw_strip(course: Course, episodes: Sequence[Episode], file: Path, console: Console) -> None:
@@ -177,7 +183,8 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
     if config.run is not None:
         decider = load_decider(config.run, config.bbc, config.behaviours)
     else:
-        decider = load_script(str(config.script), config.bbc)
+        fastest = FASTEST_CANTER if config.fastest_canter is None else config.fastest_canter
+        decider = load_script(str(config.script), config.bbc, fastest)
     if decider.student is None and set(disturbances) != {"none"}:
         raise ValueError(f"--disturbance: {decider.name} has no camera to disturb; give a student")
     cells = [(name, key) for name in names(config, decider) for key in disturbances]
@@ -212,6 +219,7 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         "bbc": decider.controller.artifact.manifest["weights"]["sha256"],
         "decision_period": decider.decision_steps * CONTROL_DT,
         "behaviours": decider.behaviours,
+        "fastest_canter": decider.fastest_canter,
         "settings": config,
         "versions": cli.versions(),
         "courses": found,

@@ -36,6 +36,7 @@ def recorded_steps(trained: Trained, bbc: Path | None, steps: int, seed: int) ->
         course_of(trained.course),
         simulator_options={"num_threads": 1, "friction_loss": controller.friction_loss},
         decision_steps=trained.decision_steps,
+        fastest_canter=trained.fastest_canter,
         depth={},
         seed=seed,
     )

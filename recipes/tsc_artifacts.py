@@ -12,7 +12,7 @@ from tsc_config import Config as TeacherConfig
 
 from agility_rl import behaviours, keys
 from agility_rl.deploy.artifact import MANIFEST_FILE, Artifact, ArtifactError
-from agility_rl.deploy.task import check_camera
+from agility_rl.deploy.task import check_camera, fastest_canter
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import constants, features
 from agility_rl.modules import RecurrentStudent, Teacher
@@ -51,6 +51,11 @@ class Trained:
     def decision_steps(self) -> int:
         """Control steps of a decision."""
         return round(self.artifact.manifest["control_period"] / constants.CONTROL_DT)
+
+    @property
+    def fastest_canter(self) -> float:
+        """What the forward speed of its canters ends at [m/s]."""
+        return fastest_canter(self.artifact)
 
     @property
     def course(self) -> str:

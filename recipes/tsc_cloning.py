@@ -14,18 +14,19 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 from tsc_config import CloningConfig
-from tsc_guide import Guide
+from tsc_guide import Guide, Sprint
 from tsc_script import Script, read
 from tsc_setup import Components
 
 from agility_rl import keys
+from agility_rl.behaviours import FASTEST_CANTER
 from agility_rl.training.seeding import permutation
 
 READ = (keys.OBSTACLE, keys.HEADING_ERROR, keys.PLACE)
 """What a script or the guide reads."""
 
 
-def clone(parts: Components, cfg: CloningConfig) -> dict[str, float]:
+def clone(parts: Components, cfg: CloningConfig, fastest_canter: float = FASTEST_CANTER) -> dict[str, float]:
     """Copy a script in several roll-outs; returns the losses of the last minibatch.
 
     Where the script says nothing, the teacher is held to what it did before: to its parameters as the environment
@@ -36,7 +37,7 @@ def clone(parts: Components, cfg: CloningConfig) -> dict[str, float]:
     Raises:
         ValueError: if the script is none.
     """
-    script = read(cfg.script, "--cloning.script")
+    script = read(cfg.script, "--cloning.script", fastest_canter)
     actor = parts.teacher.trained_actor()
     networks = actor[:-1]  # up to the distribution
     before = copy.deepcopy(networks).requires_grad_(False)
@@ -99,7 +100,7 @@ def imitation(said: TensorDictBase, label: TensorDictBase) -> dict[str, Tensor]:
     }
 
 
-def led(parts: Components, script: Script | Guide, number: int) -> Callable[[TensorDictBase], TensorDictBase]:
+def led(parts: Components, script: Script | Guide | Sprint, number: int) -> Callable[[TensorDictBase], TensorDictBase]:
     """The teacher as a policy in whose place a script drives the first robots."""
     own = parts.teacher.privileged_policy()
 

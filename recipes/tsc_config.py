@@ -11,6 +11,7 @@ from typing import Literal
 
 from hardware import HardwareConfig
 
+from agility_rl.behaviours import FASTEST_CANTER
 from agility_rl.envs.agility_rewards import TERMINATION
 from agility_rl.training.precision import Precision
 
@@ -43,6 +44,9 @@ class EnvConfig(RobotsConfig):
     """Name of a preset course (``full``, ``tunnel``, ``box``, ``hurdles``, ...), or a course file."""
     decision_steps: int = 1
     """Control steps of a decision; 1 decides at 50 Hz (method notes, section 5.1)."""
+    fastest_canter: float = FASTEST_CANTER
+    """What the forward speed of a commanded canter ends at [m/s]: Table S2's 2.0, or faster (ours), which the
+    controller has not practised. Its students and whoever runs it command the same."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,10 @@ class RewardConfig:
     """Weight of speed towards the way-point (method notes, section 5.6)."""
     least_speed: float = 0.0
     """Speed up to which that is paid [m/s], where the obstacle's own (0.4 for most) is smaller (ours)."""
+    sprint: float = 0.0
+    """Weight of each m/s towards the way-point beyond :attr:`sprint_beyond` (ours); 0: there is no such term."""
+    sprint_beyond: float = 2.0
+    """[m/s]; Table S2's fastest command."""
     heading: float = 2.0
     """Weight of looking at the way-point (method notes, section 5.6). Who stands and looks earns it all: with the
     published weights 5/6 of what a robot earns that moves on, and falls."""
@@ -122,7 +130,8 @@ class CloningConfig:
     """BEHAVIOUR:SPEED, and OBSTACLE=BEHAVIOUR:SPEED after commas, as ``evaluate_course.py --script`` takes it, or
     ``guide`` or ``leap``, which know where robots stand (``--place`` lets the teacher know too), for all obstacles or
     as ``OBSTACLE=leap`` for one. With ``own`` in place of the first, a teacher of ``--init-from`` is corrected before
-    those and keeps the rest; ``own/trot:0.6`` corrects it only while the way-point is more than 0.5 rad aside."""
+    those and keeps the rest; ``own/trot:0.6`` corrects it only while the way-point is more than 0.5 rad aside.
+    ``sprint`` corrects it behind obstacles, where it canters as fast as it may."""
     scripted: float = 0.5
     """Share of the robots that the script drives meanwhile; the teacher sees where its own choices lead with the
     rest, and is told there too what the script would do."""

@@ -5,12 +5,14 @@ The baseline that a teacher has to beat, and what a teacher may copy before it l
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from tsc_guide import LEAPS, Guide
+from tsc_guide import LEAPS, PASSAGES, Guide, Sprint
 
 from agility_rl import behaviours, keys
 from agility_rl.envs.decisions import NUM_PARAMETERS
@@ -25,17 +27,26 @@ ASIDE = 0.5
 TURN = behaviours.COMMANDS.index("yaw_rate")
 
 
-GUIDES = {"guide": Guide(), "leap": Guide(LEAPS)}
-"""In place of a script or a decision: :class:`Guide`, which knows where robots stand; ``leap`` leaps over hurdles."""
+GUIDES: dict[str, Callable[[float], Guide | Sprint]] = {
+    "guide": partial(Guide, PASSAGES),
+    "leap": partial(Guide, LEAPS),
+    "sprint": Sprint,
+}
+"""In place of a script or a decision, by the fastest canter [m/s]: :class:`Guide`, which knows where robots stand;
+``leap`` leaps over hurdles; :class:`Sprint` decides behind an obstacle only."""
 
 
-def read(text: str, option: str = "--script") -> Script | Guide:
+def read(
+    text: str, option: str = "--script", fastest_canter: float = behaviours.FASTEST_CANTER
+) -> Script | Guide | Sprint:
     """What leads robots: one of :data:`GUIDES`, or a script (:meth:`Script.parse`).
 
     Raises:
-        ValueError: if it is neither.
+        ValueError: if it is neither, or there is no such canter.
     """
-    return GUIDES[text] if text in GUIDES else Script.parse(text, option)
+    if text in GUIDES:
+        return GUIDES[text](fastest_canter)
+    return Script.parse(text, option, fastest_canter)
 
 
 @dataclass(frozen=True)
@@ -51,10 +62,10 @@ class Script:
 
     skill: Tensor
     parameters: Tensor
-    guides: dict[str, Guide] = field(default_factory=dict)
+    guides: dict[str, Guide | Sprint] = field(default_factory=dict)
 
     @classmethod
-    def parse(cls, text: str, option: str = "--script") -> Script:
+    def parse(cls, text: str, option: str = "--script", fastest_canter: float = behaviours.FASTEST_CANTER) -> Script:
         """Read ``BEHAVIOUR:SPEED``, speed in m/s, and after commas what differs, ``OBSTACLE=BEHAVIOUR:SPEED``.
 
         ``FIRST/SECOND`` in place of a decision turns by the second towards way-points that are far aside, as a canter
@@ -63,20 +74,28 @@ class Script:
         Raises:
             ValueError: if it is no such text, there is no such obstacle, or the behaviour has no such speed.
         """
+        bounds = behaviours.command_bounds(fastest_canter=fastest_canter)
+
+        def pair(decision: str) -> tuple[tuple[int, float], tuple[int, float]]:
+            """What to do straight ahead, and while the way-point is aside."""
+            first, slash, second = decision.partition("/")
+            ahead = _read(first, text, option, bounds)
+            return ahead, _read(second, text, option, bounds) if slash else ahead
+
         usual, *others = text.split(",")
-        chosen, guides = dict.fromkeys(OBSTACLES, _read_pair(usual, text, option)), {}
+        chosen, guides = dict.fromkeys(OBSTACLES, pair(usual)), {}
         for other in others:
             name, _, decision = other.partition("=")
             if name not in OBSTACLES:
                 raise ValueError(f"{option}: unknown obstacle {name!r} in {text!r}, expected {', '.join(OBSTACLES)}")
             if decision in GUIDES:
-                guides[name] = GUIDES[decision]
+                guides[name] = GUIDES[decision](fastest_canter)
             else:
-                chosen[name] = _read_pair(decision, text, option)
-        skill = torch.tensor([[skill for skill, _ in pair] for pair in chosen.values()]).T
+                chosen[name] = pair(decision)
+        skill = torch.tensor([[skill for skill, _ in told] for told in chosen.values()]).T
         parameters = torch.zeros(2, len(OBSTACLES), behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS)
-        for row, pair in enumerate(chosen.values()):
-            for case, (index, speed) in enumerate(pair):
+        for row, told in enumerate(chosen.values()):
+            for case, (index, speed) in enumerate(told):
                 if index >= 0:
                     parameters[case, row, index, 0] = speed
         return cls(skill, parameters, guides)
@@ -91,8 +110,9 @@ class Script:
     @property
     def complete(self) -> bool:
         """Whether it says something before every obstacle."""
-        led = torch.tensor([name in self.guides for name in OBSTACLES])
-        return bool(((self.skill >= 0) | led).all())
+        told = {name: guide.complete for name, guide in self.guides.items()}
+        spoken = (self.skill >= 0).all(0).tolist()
+        return all(told.get(name, own) for name, own in zip(OBSTACLES, spoken, strict=True))
 
     def decide(self, td: TensorDictBase) -> TensorDictBase:
         """Decisions of ``N`` robots under ``action``; each behaviour's turn rate leads to the way-point. Where it says
@@ -110,14 +130,7 @@ class Script:
         return td.set(keys.ACTION, TensorDict({keys.BEHAVIOUR: skill, keys.PARAMETERS: parameters}, td.batch_size))
 
 
-def _read_pair(decision: str, text: str, option: str) -> tuple[tuple[int, float], tuple[int, float]]:
-    """What to do straight ahead, and while the way-point is aside."""
-    first, slash, second = decision.partition("/")
-    ahead = _read(first, text, option)
-    return ahead, _read(second, text, option) if slash else ahead
-
-
-def _read(decision: str, text: str, option: str) -> tuple[int, float]:
+def _read(decision: str, text: str, option: str, bounds: tuple[Tensor, Tensor]) -> tuple[int, float]:
     """Behaviour and the parameter that stands for its speed; -1 for ``own``."""
     if decision == OWN:
         return -1, 0.0
@@ -126,8 +139,9 @@ def _read(decision: str, text: str, option: str) -> tuple[int, float]:
         skill, speed = behaviours.skill_index(name), float(number)
     except ValueError as error:
         raise ValueError(f"{option}: expected BEHAVIOUR:SPEED such as trot:1.2, got {text!r} ({error})") from None
-    low, high = behaviours.command_bounds()
+    low, high = bounds
     slowest, fastest = low[skill, 0].item(), high[skill, 0].item()
+    source = "Table S2" if fastest == behaviours.command_bounds()[1][skill, 0].item() else "as its fastest is set"
     if not slowest - 1e-6 <= speed <= fastest + 1e-6:
-        raise ValueError(f"{option}: {name} goes at {slowest:g} to {fastest:g} m/s (Table S2), got {number} m/s")
+        raise ValueError(f"{option}: {name} goes at {slowest:g} to {fastest:g} m/s ({source}), got {number} m/s")
     return skill, 2.0 * (speed - slowest) / (fastest - slowest) - 1.0

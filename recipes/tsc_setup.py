@@ -27,7 +27,7 @@ from agility_rl.behaviours import BEHAVIOURS, skill_index
 from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.envs import COURSES, AgilityEnv, Course, load_course
 from agility_rl.envs.agility import COURSE_RANDOMIZATION
-from agility_rl.envs.agility_rewards import AGILITY_REWARDS, AgilityTerm, goal_velocity
+from agility_rl.envs.agility_rewards import AGILITY_REWARDS, AgilityTerm, goal_velocity, sprint
 from agility_rl.envs.arena import NUM_PLACE
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import features
@@ -98,6 +98,7 @@ def build(cfg: Config) -> Components:
         cfg.env.course,
         cfg.env.decision_steps,
         simulator_options(cfg, cfg.env.num_threads),
+        fastest_canter=cfg.env.fastest_canter,
         seed=seeds.integer("environment"),
         motion_offsets=offsets,
         rewards=rewards(cfg.reward),
@@ -212,6 +213,8 @@ def rewards(cfg: RewardConfig) -> dict[str, AgilityTerm]:
     """The terms of the environment, weighted as the options say."""
     terms = dict(AGILITY_REWARDS)
     terms["goal_velocity"] = AgilityTerm(cfg.goal_velocity, partial(goal_velocity, least=cfg.least_speed))
+    if cfg.sprint:
+        terms["sprint"] = AgilityTerm(cfg.sprint, partial(sprint, beyond=cfg.sprint_beyond))
     for name in ("heading", "reach_goal"):
         terms[name] = terms[name]._replace(weight=getattr(cfg, name))
     return terms
@@ -272,4 +275,5 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     manifest["network"] = parts.teacher.settings
     manifest["bbc"] = parts.bbc.artifact.manifest["weights"]["sha256"]
     manifest["course"] = cfg.env.course
+    manifest["fastest_canter"] = cfg.env.fastest_canter
     Artifact.save(folder / "policy", saved(parts.teacher, parts.averaged).state_dict(), manifest)

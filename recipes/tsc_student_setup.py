@@ -23,12 +23,13 @@ from tsc_student_config import AugmentationConfig, Config
 from agility_rl import keys
 from agility_rl.collectors import DAggerCollector
 from agility_rl.deploy.artifact import Artifact, ArtifactError, build_manifest
-from agility_rl.deploy.task import describe_camera
+from agility_rl.deploy.task import describe_camera, fastest_canter
 from agility_rl.envs import AgilityEnv
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import features
 from agility_rl.losses import BYOLLoss, StudentLoss
 from agility_rl.modules import BYOL, DepthAugmentation, RecurrentStudent, Teacher
+from agility_rl.modules.teacher import rescale_canter
 from agility_rl.training import distributed
 from agility_rl.training.precision import hidden_precision
 from agility_rl.training.seeding import Seeds, seed_everything
@@ -121,6 +122,7 @@ def build(cfg: Config, trained: Trained) -> Components:
         cfg.env.course,
         trained.decision_steps,
         simulator_options(cfg, cfg.env.num_threads),
+        fastest_canter=trained.fastest_canter,
         depth=asdict(cfg.camera),
         seed=seeds.integer("environment"),
     )
@@ -245,9 +247,12 @@ def load_student(parts: Components, path: Path, kept: tuple[str, ...]) -> None:
             "--encoder-channels, --encoder-hidden, --encoder-features, --heading-gate and --env.course, and a teacher "
             "of the same sizes"
         )
+    weights, fastest = trained.network.state_dict(), fastest_canter(parts.teacher_artifact)
+    if trained.fastest_canter != fastest:  # it canters as fast as it did
+        weights = rescale_canter(weights, trained.fastest_canter, fastest)
     own_state = parts.student.state_dict()
     own_parts = {name: value for name, value in own_state.items() if name.split(".")[0] in kept}
-    parts.student.load_state_dict(trained.network.state_dict() | own_parts)
+    parts.student.load_state_dict(weights | own_parts)
 
 
 def annealed(first: float, last: float, iteration: int, length: int) -> float:
@@ -273,6 +278,7 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     manifest["teacher"] = parts.teacher_artifact.manifest["weights"]["sha256"]
     manifest["bbc"] = parts.bbc.artifact.manifest["weights"]["sha256"]
     manifest["course"] = cfg.env.course
+    manifest["fastest_canter"] = fastest_canter(parts.teacher_artifact)
     manifest["byol"] = cfg.byol
     manifest["camera"] = describe_camera() | {"training": asdict(cfg.camera)}
     Artifact.save(folder / "policy", parts.student.state_dict(), manifest)

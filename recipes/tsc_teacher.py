@@ -32,9 +32,10 @@ from tsc_setup import Components, build, save_policy
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact
+from agility_rl.deploy.task import fastest_canter
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.losses import functional
-from agility_rl.modules.teacher import widen_place
+from agility_rl.modules.teacher import rescale_canter, widen_place
 from agility_rl.training import cli
 
 HEADLINE: tuple[str, ...] = (
@@ -113,21 +114,23 @@ def begin(parts: Components, cfg: Config) -> None:
     """Where a new run starts from: another run's teacher, a copied script, or the one corrected by the other."""
     if cfg.init_from is not None:
         start = Artifact.load(cfg.init_from, kind="teacher")
-        had, place = start.manifest.get("network", {}).get("num_place", 0), parts.teacher.settings["num_place"]
-        if had < place:  # who did not read its place goes on as it was; who did is refused by a run without
-            start = replace(start, state=widen_place(start.state, place - had))
+        read_place, place = start.manifest.get("network", {}).get("num_place", 0), parts.teacher.settings["num_place"]
+        if read_place < place:  # who did not read its place goes on as it was; who did is refused by a run without
+            start = replace(start, state=widen_place(start.state, place - read_place))
+        if (had := fastest_canter(start)) != cfg.env.fastest_canter:  # it canters as fast as it did
+            start = replace(start, state=rescale_canter(start.state, had, cfg.env.fastest_canter))
         start.fill(parts.teacher)
         head = parts.teacher.actor.network.parameters_head
         head.min_std.fill_(cfg.ppo.min_std)
         head.std.data.clamp_(cfg.ppo.min_std, cfg.ppo.initial_std)
     if copies(cfg):
         set_course(parts.env, parts.curriculum)
-        clone(parts, cfg.cloning)
+        clone(parts, cfg.cloning, cfg.env.fastest_canter)
 
 
 def copies(cfg: Config) -> bool:
     """Whether a new run copies its script: one that starts from a teacher does so where the script says ``own``."""
-    complete = read(cfg.cloning.script, "--cloning.script").complete
+    complete = read(cfg.cloning.script, "--cloning.script", cfg.env.fastest_canter).complete
     return cfg.cloning.iterations > 0 and complete == (cfg.init_from is None)
 
 
@@ -136,7 +139,7 @@ def train(cfg: Config) -> Path:
     cfg = own_options(cfg)
     if unknown := sorted(set(cfg.behaviours) - set(BEHAVIOURS)):
         raise ValueError(f"--behaviours: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
-    script = read(cfg.cloning.script, "--cloning.script")
+    script = read(cfg.cloning.script, "--cloning.script", cfg.env.fastest_canter)
     if not script.complete and cfg.init_from is None and cfg.resume is None:
         raise ValueError(
             f"--cloning.script {cfg.cloning.script} keeps what a teacher does; give it by --init-from, or a script "

@@ -82,3 +82,21 @@ def test_parameters_reach_both_ends_of_every_range_and_no_further() -> None:
         command, shift = behaviours.commands_from_parameters(skill, torch.full((5, 6), value))
         torch.testing.assert_close(command, bound)
         assert torch.equal(shift, torch.full((5, 1), max(-1.0, min(1.0, value))))
+
+
+def test_a_faster_canter_moves_one_number() -> None:
+    bounds = command_bounds(fastest_canter=3.2)
+    expected = command_bounds()[1].clone()
+    expected[skill_index("canter"), 0] = 3.2
+    torch.testing.assert_close(bounds[1], expected)
+    assert torch.equal(bounds[0], command_bounds()[0])
+    skill, parameters = torch.tensor([skill_index("canter"), skill_index("trot")]), torch.full((2, 6), 0.5)
+    command, _ = behaviours.commands_from_parameters(skill, parameters, bounds)
+    assert command[:, 0].tolist() == pytest.approx([2.6, 1.25])  # three quarters of 0.8 to 3.2, and of 0.5 to 1.5
+    assert behaviours.FASTEST_CANTER == 2.0
+
+
+@pytest.mark.parametrize("speed", [0.8, -1.0, 5.1, float("nan")])
+def test_an_impossible_canter_is_refused(speed: float) -> None:
+    with pytest.raises(ValueError, match=r"fastest canter: expected more than 0.8 and at most 5 m/s, got"):
+        command_bounds(fastest_canter=speed)

@@ -83,7 +83,8 @@ class DeployedStudent:
     it was trained with. Its memory and history begin anew with :meth:`reset`. How old the newest image is, it reports
     to the safety checks by :meth:`sources`; an image that cannot be used raises, which ends in damping.
 
-    Source: supplement, sections S3 and S6; commands from parameters: Table S2 and method notes, section 5.1.
+    Source: supplement, sections S3 and S6; commands from parameters: Table S2 (a canter may be faster, as its manifest
+    says) and method notes, section 5.1.
 
     Args:
         network: :func:`torch_student` or :func:`onnx_student`.
@@ -98,6 +99,7 @@ class DeployedStudent:
 
     Raises:
         ArtifactError: if it was trained with another behaviour controller.
+        ValueError: if it commands canters that there are none of.
 
     Example:
         >>> import tempfile
@@ -126,6 +128,7 @@ class DeployedStudent:
             )
         self.network = network
         self.eyes, self.steps = eyes, max(1, round(artifact.manifest["control_period"] / period))
+        self._bounds = behaviours.command_bounds(fastest_canter=fastest_canter(artifact))
         self._memory_size = memory_size(artifact)
         self._preprocess = DepthPreprocessor()
         with torch.inference_mode():
@@ -170,7 +173,7 @@ class DeployedStudent:
         )
         self.heading, self.obstacle = heading[0], int(obstacle[0].argmax())
         skill = logits.argmax(-1)
-        command, shift = behaviours.commands_from_parameters(skill, parameters[:, int(skill)])
+        command, shift = behaviours.commands_from_parameters(skill, parameters[:, int(skill)], self._bounds)
         return BehaviourCommand(int(skill), command[0], float(shift[0]))
 
     def sources(self) -> Mapping[str, float]:
@@ -186,6 +189,18 @@ def memory_size(artifact: Artifact) -> int:
     if not network.get("num_place"):
         return units
     return sum(memory_parts(units, sum(map(len, network["routes"])), len(network["way_points"][0])))
+
+
+def fastest_canter(artifact: Artifact) -> float:
+    """What the forward speed of its canters ends at [m/s]: Table S2's, unless the manifest says otherwise.
+
+    Raises:
+        ArtifactError: if the manifest says what is no number.
+    """
+    said = artifact.manifest.get("fastest_canter", behaviours.FASTEST_CANTER)
+    if isinstance(said, bool) or not isinstance(said, int | float):
+        raise ArtifactError(f"{artifact.folder}: expected fastest_canter in m/s in the manifest, got {said!r}")
+    return float(said)
 
 
 def example_inputs(memory: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -69,6 +69,7 @@ class AgilityEnv(EnvBase):
         simulator_options: keyword arguments of :func:`agility_rl.simulation.make_simulator`.
         decision_steps: control steps of a decision; 1 decides at 50 Hz.
         command_noise: factors that commands are multiplied by; (1, 1) for none.
+        fastest_canter: what the forward speed of a commanded canter ends at [m/s]; Table S2's, or a faster one (ours).
         rewards: reward terms by name.
         termination_reward: weight of a failure.
         terminations: failures by name; an episode ends when one of them holds.
@@ -109,6 +110,7 @@ class AgilityEnv(EnvBase):
         simulator_options: Mapping[str, Any] | None = None,
         decision_steps: int = 1,
         command_noise: tuple[float, float] = COMMAND_NOISE,
+        fastest_canter: float = behaviours.FASTEST_CANTER,
         rewards: Mapping[str, AgilityTerm] = AGILITY_REWARDS,
         termination_reward: float = TERMINATION,
         terminations: Mapping[str, Termination] = AGILITY_TERMINATIONS,
@@ -146,7 +148,7 @@ class AgilityEnv(EnvBase):
         self.termination_reward = termination_reward
         self.randomization = randomization
         self.max_steps = round(episode_length / self.dt)
-        self.decisions = Decisions(num_robots, self.generator, command_noise)
+        self.decisions = Decisions(num_robots, self.generator, command_noise, fastest_canter)
         self.observations = ObservationGroups(num_robots, self.generator, observation_noise, motion_offsets)
         interval = None if push_interval is None else round(push_interval / self.dt)
         self.pushes = Pushes(num_robots, self.generator, interval, push_velocity)

@@ -42,6 +42,21 @@ def goal_velocity(state: AgilityState, least: float = 0.0) -> Tensor:
     return torch.minimum(towards, target) / (target + 1e-5)
 
 
+def sprint(state: AgilityState, beyond: float) -> Tensor:
+    """``max(v_xy . d - beyond, 0)`` [m/s]: what :func:`goal_velocity` cannot say.
+
+    Paid by the metre, speed up to a target earns the same on a given way, however fast it is covered; beyond ``beyond``
+    a sprint earns more, the faster it is.
+
+    Source: ours.
+
+    Args:
+        state: the present.
+        beyond: speed towards the goal that earns nothing yet [m/s].
+    """
+    return ((state.velocity * state.goal_direction).sum(-1) - beyond).clamp(min=0.0)
+
+
 def heading(state: AgilityState) -> Tensor:
     """``exp(-|heading error|)`` to the current way-point (section 5.6)."""
     return torch.exp(-state.heading_error[:, 0].abs())

@@ -27,8 +27,10 @@ class Decisions:
         num_robots: N.
         generator: source of the command noise; where it is, the tensors are.
         noise: lowest and highest factor on each command.
+        fastest_canter: what the canter's forward speed ends at [m/s]; Table S2's, or a faster one (ours).
 
     Attributes:
+        bounds: lower and upper ends of all commands.
         commands: what the Basic Behaviour Controller is told.
         behaviours: int64 ``[N, 3]``, chosen in this control step and the two before, newest first.
         parameters: ``[N, 2, 5, 6]``, the policy's numbers for all behaviours, of this control step and the one before.
@@ -41,10 +43,17 @@ class Decisions:
         [1.8, 0.3, 0.5, 0.55, 0.0]
     """
 
-    def __init__(self, num_robots: int, generator: torch.Generator, noise: tuple[float, float] = COMMAND_NOISE) -> None:
+    def __init__(
+        self,
+        num_robots: int,
+        generator: torch.Generator,
+        noise: tuple[float, float] = COMMAND_NOISE,
+        fastest_canter: float = behaviours.FASTEST_CANTER,
+    ) -> None:
         if not 0.0 <= noise[0] <= noise[1]:
             raise ValueError(f"command noise must be (low, high) with 0 <= low <= high, got {noise}")
         self.generator, self.noise, device = generator, noise, generator.device
+        self.bounds = behaviours.command_bounds(device, fastest_canter)
         self.commands = CommandSampler(num_robots, generator, period=None)
         self.behaviours = torch.zeros(num_robots, 3, dtype=torch.int64, device=device)
         self.parameters = torch.zeros(num_robots, 2, behaviours.NUM_BEHAVIOURS, NUM_PARAMETERS, device=device)
@@ -60,7 +69,7 @@ class Decisions:
     def decide(self, behaviour: Tensor, parameters: Tensor) -> None:
         """Take a decision of every robot, int64 ``[N]`` and ``[N, 5, 6]``."""
         chosen = parameters.take_along_dim(behaviour[:, None, None], 1)[:, 0].clamp(-1.0, 1.0)
-        command, shift = behaviours.commands_from_parameters(behaviour, chosen)
+        command, shift = behaviours.commands_from_parameters(behaviour, chosen, self.bounds)
         if self.noise[0] != self.noise[1]:
             command = command * uniform(command.shape, self.noise, self.generator)
         self.commands.assign(torch.ones_like(self.fresh), behaviour, command, shift)

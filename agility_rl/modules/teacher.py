@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from agility_rl import keys
+from agility_rl.behaviours import NUM_BEHAVIOURS, command_bounds, skill_index
 from agility_rl.go2 import features
 from agility_rl.modules.adaptation import HistoryEncoder, PrivilegedEncoder
 from agility_rl.modules.behaviour_controller import NUM_LATENT
@@ -19,6 +20,8 @@ from agility_rl.modules.scandots import NUM_TERRAIN_LATENT, ScandotsEncoder
 
 NUM_HEADING = 2
 """Heading errors to the current and to the next way-point (method notes, section 5.4)."""
+
+CANTER = skill_index("canter")
 
 
 def widen_place(weights: Mapping[str, Tensor], more: int) -> dict[str, Tensor]:
@@ -38,6 +41,37 @@ def widen_place(weights: Mapping[str, Tensor], more: int) -> dict[str, Tensor]:
     """
     first = next(name for name in weights if name.endswith("trunk.layers.0.weight"))
     return {**weights, first: pad(weights[first], (0, more))}
+
+
+def rescale_canter(weights: Mapping[str, Tensor], fastest: float, now: float) -> dict[str, Tensor]:
+    """Weights whose canters are commanded as fast as before when another fastest canter is the end of the range.
+
+    Speeds that the old range cut off at its end are the only ones that become others.
+
+    Source: no equation of the paper (ours).
+
+    Args:
+        weights: state dict of a teacher or a student, or of its actor.
+        fastest: what the canter's forward speed ended at [m/s].
+        now: what it ends at from now on [m/s].
+
+    Example:
+        >>> import torch
+        >>> last = "parameters_head.mean.0."
+        >>> old = {last + "weight": torch.ones(30, 8), last + "bias": torch.ones(30)}  # 5 behaviours x 6 parameters
+        >>> new = rescale_canter(old, 2.0, 3.2)  # half of the range is what all of it was
+        >>> new[last + "weight"][18, 0].item(), round(new[last + "bias"][18].item(), 4)  # row of the canter's speed
+        (0.5, 0.0)
+    """
+    low, high = (bound[CANTER, 0].item() for bound in command_bounds(fastest_canter=fastest))
+    share = (high - low) / (command_bounds(fastest_canter=now)[1][CANTER, 0].item() - low)
+    changed = {}
+    for name, offset in (("weight", 0.0), ("bias", 1.0)):  # p becomes share * (p + 1) - 1
+        key = next(key for key in weights if key.endswith(f"parameters_head.mean.0.{name}"))
+        rows = weights[key].unflatten(0, (NUM_BEHAVIOURS, -1)).clone()
+        rows[CANTER, 0] = share * (rows[CANTER, 0] + offset) - offset
+        changed[key] = rows.flatten(0, 1)
+    return {**weights, **changed}
 
 
 class Teacher(nn.Module):

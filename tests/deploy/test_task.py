@@ -106,6 +106,22 @@ def test_decisions_are_those_of_the_training_policy(
     assert len(chosen) > 3, "it decides anew"
 
 
+def test_its_canters_are_as_fast_as_its_manifest_says(
+    student: RecurrentStudent, save: Callable[..., Artifact], artifact: Artifact
+) -> None:
+    """The same network that always canters as fast as it may, from manifests with and without the entry."""
+    with torch.no_grad():
+        student.actor.network.choice_head[-1].bias[3] = 100.0
+        student.actor.network.parameters_head.mean[-1].bias.view(5, 6)[3, 0] = 100.0
+    look = Perception(0.0, RobotState.standing(), torch.zeros(45), torch.zeros(4))
+    for entry, fastest in (({}, 2.0), ({"fastest_canter": 3.2}, 3.2), ({"fastest_canter": 3}, 3.0)):
+        told = deployed_student(save(**entry), artifact, StillImage(1.0)).decide(look)
+        assert (told.name, told.command[0].item()) == ("canter", pytest.approx(fastest)), entry
+    for wrong, message in (("fast", r"expected fastest_canter in m/s in the manifest, got 'fast'"), (9.0, "got 9")):
+        with pytest.raises(ValueError, match=message):
+            deployed_student(save(fastest_canter=wrong), artifact, StillImage(1.0))
+
+
 def test_it_looks_only_when_a_decision_is_due_and_forgets_at_a_start(
     save: Callable[..., Artifact], artifact: Artifact
 ) -> None:

@@ -107,6 +107,15 @@ def test_shapes_are_those_of_the_documentation(build: Build) -> None:
     assert set(rollout["next", keys.REWARD_TERMS].keys()) == {*AGILITY_REWARDS, "termination"}
 
 
+def test_the_fastest_canter_reaches_the_controller(build: Build) -> None:
+    env = build(2, command_noise=(1.0, 1.0), fastest_canter=3.2)
+    decision = {keys.BEHAVIOUR: torch.tensor([3, 2]), keys.PARAMETERS: torch.ones(2, 5, 6)}
+    after = env.step(env.reset().set(keys.ACTION, TensorDict(decision, [2])))["next"]
+    assert after[keys.COMMAND][:, 0].tolist() == pytest.approx([3.2, 1.5])
+    with pytest.raises(ValueError, match=r"fastest canter: expected more than 0.8 and at most 5 m/s, got 7"):
+        build(2, fastest_canter=7.0)
+
+
 def test_the_number_of_threads_changes_nothing(build: Build) -> None:
     one, two = (run(build(5, simulator_options={"num_threads": n}, **EVERYTHING), 25)[0] for n in (1, 2))
     assert_same(one, two)

@@ -38,6 +38,13 @@ def test_goal_velocity_counts_up_to_the_target(on_course: Make) -> None:
     assert rewards.goal_velocity(fast).item() == pytest.approx(1.0, abs=1e-4)
 
 
+def test_a_sprint_counts_beyond_a_speed(on_course: Make) -> None:
+    direction = torch.tensor([[1.0, 0.0], [0.6, 0.8], [1.0, 0.0]])
+    velocity = torch.tensor([[1.9, 5.0], [1.8, 2.4], [-4.0, 0.0]])  # 1.9, 3 and -4 m/s towards the goal
+    state = on_course(3, goal_direction=direction, velocity=velocity)
+    torch.testing.assert_close(rewards.sprint(state, beyond=2.0), torch.tensor([0.0, 1.0, 0.0]))
+
+
 def test_heading_and_goal(on_course: Make) -> None:
     state = on_course(2, heading_error=torch.tensor([[0.5, 3.0], [-1.0, 0.0]]), at_goal=torch.tensor([True, False]))
     torch.testing.assert_close(rewards.heading(state), torch.tensor([math.exp(-0.5), math.exp(-1.0)]))

@@ -39,6 +39,14 @@ def test_noise_multiplies_each_command_but_not_the_shift(generator: torch.Genera
         Decisions(1, generator, noise=(1.2, 0.8))
 
 
+def test_canters_may_be_commanded_faster_than_in_table_s2(generator: torch.Generator) -> None:
+    decisions = Decisions(3, generator, noise=(1.0, 1.0), fastest_canter=3.2)
+    decisions.decide(torch.tensor([3, 3, 4]), numbers(3, 0.5) * torch.tensor([1.0, 4.0, 4.0])[:, None, None])
+    assert decisions.commands.command[:, 0].tolist() == pytest.approx([2.6, 3.2, 1.8])
+    with pytest.raises(ValueError, match=r"fastest canter: expected more than 0.8"):
+        Decisions(1, generator, fastest_canter=0.5)
+
+
 def test_memory_runs_on_the_control_steps(generator: torch.Generator) -> None:
     decisions = Decisions(1, generator)
     seen = []

@@ -114,6 +114,11 @@ def test_a_script_needs_no_teacher_and_a_course_may_be_a_file(
     assert pictures == {"course_mine.png", "course_box.png", "course_behaviours.png"}
 
 
+def test_a_script_may_canter_faster(recipe: ModuleType, config: Any, tmp_path: Path) -> None:
+    scripted = replace(config, run=None, script="canter:2.8", fastest_canter=3.0, output=tmp_path, course=("hurdles",))
+    assert recipe.evaluate(scripted, screen())["fastest_canter"] == 3.0
+
+
 def test_fewer_behaviours(deciders: ModuleType, teacher: Path, untrained: Path) -> None:
     decider = deciders.load_decider(teacher, untrained, ("jump",))
     sizes = {"proprioception": (45,), "history": (10, 45), "heading_error": (2,), "obstacle": (7,), "scandots": (132,)}
@@ -264,6 +269,9 @@ def test_groups_of_courses(deciders: ModuleType, recipe: ModuleType, untrained: 
         ({"run": None, "script": "gallop:2"}, "expected BEHAVIOUR:SPEED such as trot:1.2, got 'gallop:2'"),
         ({"run": None, "script": "trot"}, "expected BEHAVIOUR:SPEED such as trot:1.2, got 'trot'"),
         ({"run": None, "script": "trot:9"}, r"trot goes at 0\.5 to 1\.5 m/s \(Table S2\), got 9 m/s"),
+        ({"run": None, "script": "canter:2.1"}, r"canter goes at 0\.8 to 2 m/s \(Table S2\), got 2.1 m/s"),
+        ({"run": None, "script": "trot:1", "fastest_canter": 9.0}, "fastest canter: expected more than 0.8"),
+        ({"fastest_canter": 3.0}, "what a teacher or student commands was settled in training"),
         ({"course": ("nowhere",)}, "unknown course 'nowhere'"),
         ({"behaviours": ("gallop",)}, "'gallop' is no behaviour"),
         ({"run": Path("nowhere")}, "nowhere: expected the folder of a run"),

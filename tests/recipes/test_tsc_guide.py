@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from agility_rl import keys
-from agility_rl.behaviours import commands_from_parameters, skill_index
+from agility_rl.behaviours import command_bounds, commands_from_parameters, skill_index
 from agility_rl.envs.mirror import mirror
 from agility_rl.envs.obstacles import OBSTACLES
 
@@ -93,3 +93,17 @@ def test_poles_are_passed_on_alternating_sides(module: Module) -> None:
     turn = torch.tensor([1.0, -1.0, 1.0]) * min(guide.STEERING * math.atan2(guide.SWAY, 0.5), 1.57)
     torch.testing.assert_close(command[:, 2], turn, atol=1e-3, rtol=0.0)
     assert (command[:, 0] - guide.SLOW).abs().max() < 1e-5 and not bool(command[:, 1].abs().gt(1e-6).any())
+
+
+def test_its_speeds_are_the_same_whatever_the_fastest_canter_is(module: Module) -> None:
+    guide = module("tsc_guide")
+    td = standing("bar_jump", (-1.0, 0.0, 0.0), (-2.9, 0.0, 0.0))  # a canter at 1.6 m/s, and a trot
+    usual, fast = (guide.Guide(guide.PASSAGES, fastest).decide(td.clone())[keys.ACTION] for fastest in (2.0, 3.2))
+    rows = torch.arange(2)
+    assert usual[keys.BEHAVIOUR].tolist() == fast[keys.BEHAVIOUR].tolist() == [3, 2]
+    commanded = [
+        commands_from_parameters(one[keys.BEHAVIOUR], one[keys.PARAMETERS][rows, one[keys.BEHAVIOUR]], bounds)[0]
+        for one, bounds in ((usual, command_bounds()), (fast, command_bounds(fastest_canter=3.2)))
+    ]
+    torch.testing.assert_close(*commanded)
+    assert commanded[0][0, 0].item() == pytest.approx(1.6)

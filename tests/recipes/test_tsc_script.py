@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from agility_rl import keys
-from agility_rl.behaviours import BEHAVIOURS, commands_from_parameters
+from agility_rl.behaviours import BEHAVIOURS, command_bounds, commands_from_parameters
 from agility_rl.envs.obstacles import OBSTACLES
 
 
@@ -87,12 +87,41 @@ def test_a_second_decision_turns_to_way_points_that_are_aside(script: Any) -> No
     assert command[:3, 2].tolist() == pytest.approx([0.5, 1.02, -1.02])  # a canter's turn rate ends at 0.5
 
 
+def test_a_faster_canter_may_be_commanded_where_it_is_the_end_of_the_range(script: Any) -> None:
+    chosen = script.parse("canter:2.6/trot:1.0", fastest_canter=3.2)
+    action = chosen.decide(seen(["tunnel", "tunnel"], [0.1, 1.0]))["action"]
+    parameters = action["parameters"].take_along_dim(action["behaviour"][:, None, None], 1)[:, 0]
+    bounds = command_bounds(fastest_canter=3.2)
+    command, _ = commands_from_parameters(action["behaviour"], parameters, bounds)
+    assert command[:, 0].tolist() == pytest.approx([2.6, 1.0])
+    with pytest.raises(ValueError, match=r"--script: canter goes at 0.8 to 3.2 m/s \(as its fastest is set\), got 3.5"):
+        script.parse("canter:3.5", fastest_canter=3.2)
+    with pytest.raises(ValueError, match=r"fastest canter: expected more than 0.8 and at most 5 m/s, got 6"):
+        script.parse("trot:1.0", fastest_canter=6.0)
+
+
+def test_a_sprint_leaves_the_rest_to_a_teacher(script: Any, module: Callable[[str], ModuleType]) -> None:
+    sprint = module("tsc_script").read("sprint")
+    assert not sprint.complete and not script.parse("trot:1.0,bar_jump=sprint").complete
+    chosen = script.parse("own,bar_jump=sprint")
+    td = seen(["bar_jump", "bar_jump", "tunnel"], [0.0, 0.1, 0.1])
+    td["place"] = torch.tensor([[0.5, 0.0, 2.0, 0.0, x, 0.0, 0.0, 1.0] for x in (-0.5, 0.5, 0.5)])
+    action = chosen.decide(td)["action"]
+    assert action["behaviour"].tolist() == [-1, 3, -1] and chosen.behaviours == ("canter",)
+    for fastest, expected in ((3.2, 3.2), (4.2, 3.359)):  # 3.1 at 0.13 m, 0.7 more for each metre
+        action = script.parse("own,bar_jump=sprint", fastest_canter=fastest).decide(td.clone())["action"]
+        bounds = command_bounds(fastest_canter=fastest)
+        command, _ = commands_from_parameters(action["behaviour"][1:2], action["parameters"][1:2, 3], bounds)
+        assert command[0, [0, 2]].tolist() == pytest.approx([expected, 0.2])  # 2 rad/s for each radian
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("trot", r"--script: expected BEHAVIOUR:SPEED such as trot:1.2, got 'trot'"),
         ("gallop:2", r"got 'gallop:2' \(.*gallop"),
         ("trot:fast", r"got 'trot:fast'"),
+        ("canter:2.1", r"--script: canter goes at 0.8 to 2 m/s \(Table S2\), got 2.1 m/s"),
         ("trot:1.7", r"--script: trot goes at 0.5 to 1.5 m/s \(Table S2\), got 1.7 m/s"),
         ("trot:1.2,hoop=jump:1.0", r"--script: unknown obstacle 'hoop' in .*, expected bar_jump, a_frame"),
         ("trot:1.2,tunnel", r"expected BEHAVIOUR:SPEED such as trot:1.2"),

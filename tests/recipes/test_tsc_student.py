@@ -220,6 +220,26 @@ def test_a_student_of_another_teacher_takes_this_ones_estimator(
     assert any(name.startswith("estimator.") for name in state)
 
 
+def test_a_student_commands_canters_as_fast_as_its_teacher(
+    recipe: ModuleType, module: Module, smoke: Any, untrained_teacher: Path
+) -> None:
+    own = recipe.train(replace(smoke, name="slow", iterations=1))
+    artifact = Artifact.load(untrained_teacher / "policy")
+    Artifact.save(untrained_teacher / "policy", artifact.state, artifact.manifest | {"fastest_canter": 3.2})
+    run = recipe.train(replace(smoke, name="fast", iterations=1, init_from=own))
+    assert [Artifact.load(one / "policy").manifest["fastest_canter"] for one in (own, run)] == [2.0, 3.2]
+    setup = module("tsc_student_setup")
+    cfg, trained = setup.resolve(replace(smoke, init_from=own))
+    parts = setup.build(cfg, trained)
+    assert parts.env.decisions.bounds[1][3, 0].item() == pytest.approx(3.2)
+    setup.load_student(parts, own, ())
+    name = "actor.module.0.module.parameters_head.mean.0.weight"  # the canter's speed is row 18 of 30
+    was = Artifact.load(own / "policy").state[name]
+    torch.testing.assert_close(parts.student.state_dict()[name][18], 0.5 * was[18])  # 1.2 of 2.4 m/s
+    assert torch.equal(parts.student.state_dict()[name][19], was[19])
+    parts.env.close()
+
+
 def test_labels_are_what_is_applied(module: Module, smoke: Any) -> None:
     """A teacher that says far more than the environment takes is copied in what it takes."""
     setup = module("tsc_student_setup")

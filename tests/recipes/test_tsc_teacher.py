@@ -12,6 +12,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from agility_rl.behaviours import command_bounds, commands_from_parameters
 from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.modules import Teacher
@@ -129,6 +130,35 @@ def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
     assert "success/box_jump" in scalars and "success/tunnel" not in scalars
 
 
+def test_a_teacher_with_a_faster_canter_says_so_and_goes_on_as_fast_as_it_did(
+    recipe: ModuleType, module: Module, smoke: Any, untrained: Path
+) -> None:
+    """Its manifest, whoever runs it, and a teacher that starts from one with another range."""
+    slow = recipe.train(replace(smoke, name="slow", iterations=1))
+    sprint = replace(smoke.cloning, script="sprint")
+    reward = replace(smoke.reward, sprint=15.0)
+    fast = replace(
+        smoke, name="fast", init_from=slow, env=replace(smoke.env, fastest_canter=3.2), cloning=sprint, reward=reward
+    )
+    run = recipe.train(replace(fast, iterations=1))
+    assert [Artifact.load(one / "policy").manifest["fastest_canter"] for one in (slow, run)] == [2.0, 3.2]
+    assert module("deciders").load_decider(run, untrained).fastest_canter == 3.2
+    assert "task/sprint" in read_scalars(run) and "task/sprint" not in read_scalars(slow)
+    parts = recipe.build(fast)
+    recipe.begin(parts, replace(fast, cloning=replace(sprint, iterations=0)))
+    parent = module("tsc_artifacts").load_trained(slow).network
+    seen = parts.env.reset()
+    with torch.no_grad():
+        was, now = (
+            teacher.privileged_policy()(seen.clone())["loc"].clamp(max=1.0)[:, 3] for teacher in (parent, parts.teacher)
+        )
+    skill = torch.full((len(seen),), 3)
+    expected, _ = commands_from_parameters(skill, was)
+    told, _ = commands_from_parameters(skill, now, command_bounds(fastest_canter=3.2))
+    torch.testing.assert_close(told, expected, atol=1e-5, rtol=0.0)
+    parts.env.close()
+
+
 def test_options_of_the_course_reach_it(recipe: ModuleType, smoke: Any) -> None:
     env = replace(smoke.env, goal_radius=0.45, start_spread=2.0, start_after=0.5)
     reward = replace(smoke.reward, termination=-500.0, heading=0.25)
@@ -162,6 +192,7 @@ def test_the_curriculum_by_hand(module: Module) -> None:
         (("--env.course", "nowhere"), "unknown course 'nowhere'; expected one of full"),
         (("--env.course", "nowhere.toml"), "nowhere.toml: cannot be read"),
         (("--behaviours", "trot", "gallop"), "unknown gallop"),
+        (("--env.fastest-canter", "0.5"), "fastest canter: expected more than 0.8 and at most 5 m/s, got 0.5"),
         (("--bbc", "nowhere"), "nowhere"),
         (("--env.num-robot", "3"), "did you mean --env.num-robots"),
     ],
