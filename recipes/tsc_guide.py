@@ -17,6 +17,7 @@ from agility_rl import behaviours, keys, rotations
 from agility_rl.behaviours import FASTEST_CANTER, command_bounds, skill_index
 from agility_rl.envs.decisions import NUM_PARAMETERS
 from agility_rl.envs.obstacles import OBSTACLES, POLE_SPACING
+from agility_rl.tensors import constant
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,8 @@ class Guide:
         self._fastest_canter = fastest_canter
         self.behaviours = tuple(sorted({USUAL, *(passage.behaviour for passage in passages.values())}))
         ordered = [passages[name] for name in OBSTACLES]
-        self._figures = torch.tensor([[p.start, p.speed, p.tolerance, p.run_up, p.beside] for p in ordered])
-        self._skill = torch.tensor([skill_index(p.behaviour) for p in ordered])
+        self._figures = tuple((p.start, p.speed, p.tolerance, p.run_up, p.beside) for p in ordered)
+        self._skill = tuple(skill_index(p.behaviour) for p in ordered)
 
     def decide(self, td: TensorDictBase) -> TensorDictBase:
         """Decisions of ``N`` robots under ``action``.
@@ -125,7 +126,7 @@ class Guide:
             td: ``place`` [N, 8] [m] and ``obstacle`` [N, 7] (:mod:`agility_rl.keys`).
         """
         kind, place = td[keys.OBSTACLE].argmax(-1), td[keys.PLACE]
-        start, speed, tolerance, run_up, beside = self._figures.to(place.device)[kind].unbind(-1)
+        start, speed, tolerance, run_up, beside = constant(self._figures, place.device)[kind].unbind(-1)
         ahead, aside = place[:, :2].unbind(-1)  # of the way-point, in the robot's frame
         x, y, sine, cosine = place[:, 4:].unbind(-1)
         goal_x = x + cosine * ahead - sine * aside
@@ -142,7 +143,7 @@ class Guide:
         error = rotations.wrap_angle(wanted - heading)
         on_line = (off.abs() < tolerance) & (error.abs() < ALIGNED)
         passing = weaving | ((left < 0.0) & ~far) | ((left < run_up) & on_line)
-        skill = torch.where(passing, self._skill.to(place.device)[kind], skill_index(USUAL))
+        skill = torch.where(passing, constant(self._skill, place.device, torch.int64)[kind], skill_index(USUAL))
         calm = torch.exp(-((error.abs() - ALIGNED).clamp(min=0.0) / 0.4).square())
         late = torch.where(off.abs() > tolerance, (left / 0.8).clamp(0.0, 1.0), 1.0)  # beside the axis: slowly
         cruise = torch.where(run_up > 0.0, CRUISE, (speed + left.clamp(min=0.0)).clamp(max=CRUISE))
