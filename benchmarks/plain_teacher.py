@@ -47,7 +47,8 @@ class Plain:
     """Networks, memory and one training iteration, by hand."""
 
     def __init__(self, parts: Any, cfg: Any) -> None:
-        self.env, self.cfg, self.discriminator = parts.env, cfg, parts.discriminator
+        self.env, self.cfg = parts.env, cfg
+        self.discriminator = None if parts.imitation is None else parts.imitation.discriminator
         teacher, ppo = parts.teacher, cfg.ppo
         self.scandots, self.privileged = like(teacher.scandots_encoder), like(teacher.privileged_encoder)
         self.estimator, self.history = like(teacher.estimator), History()

@@ -30,8 +30,8 @@ from agility_rl.envs.agility import COURSE_RANDOMIZATION
 from agility_rl.envs.agility_rewards import AGILITY_REWARDS, AgilityTerm, goal_velocity, sprint
 from agility_rl.envs.arena import NUM_PLACE
 from agility_rl.envs.obstacles import OBSTACLES
-from agility_rl.go2 import features
-from agility_rl.losses import AdaptationLoss, HybridPPOLoss
+from agility_rl.go2 import constants, features
+from agility_rl.losses import AdaptationLoss, HybridPPOLoss, ImitationReward
 from agility_rl.modules import Critic, Discriminator, FeatureNormalizer, Teacher
 from agility_rl.training.exploration import LastingNoise
 from agility_rl.training.ppo import FirstGroup, PPOUpdate
@@ -55,7 +55,7 @@ class Components:
     teacher: Teacher
     averaged: AveragedModel | None
     critic: Critic
-    discriminator: Discriminator | None
+    imitation: ImitationReward | None
     curriculum: Curriculum
     rollout: Rollout
     noise: LastingNoise | None
@@ -92,6 +92,10 @@ def build(cfg: Config) -> Components:
     seeds = seed_everything(cfg.seed, device)
     controller = load_controller(cfg.bbc)
     discriminator, offsets = load_discriminator(controller.run, cfg.reward.imitation > 0.0)
+    imitation = None
+    if discriminator is not None:
+        seconds = constants.CONTROL_DT * cfg.env.decision_steps
+        imitation = ImitationReward(discriminator.to(device), cfg.reward.imitation * seconds)
     env = make_env(
         cfg.env,
         controller,
@@ -149,7 +153,7 @@ def build(cfg: Config) -> Components:
         teacher=teacher,
         averaged=moving_average(teacher, ppo.averaging),
         critic=critic,
-        discriminator=None if discriminator is None else discriminator.to(device),
+        imitation=imitation,
         curriculum=Curriculum.start(cfg.curriculum, env),
         rollout=Rollout(
             env,

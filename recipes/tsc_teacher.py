@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from course_metrics import judge, set_course
 from held_fixed import fit, infer
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from training_run import Laps, own_options, run
 from tsc_cloning import clone
@@ -53,14 +53,12 @@ HEADLINE += tuple(f"use/{name}" for name in BEHAVIOURS)
 @torch.no_grad()
 def add_rewards(parts: Components, cfg: Config, batch: TensorDictBase) -> dict[str, Tensor]:
     """``r = 2.0 r^T + 0.2 r^I dt`` (Table S4); returns the means of both."""
-    rewards = {"task": cfg.reward.task * batch["next", "reward"]}
-    if parts.discriminator is not None:
-        seen = TensorDict({keys.MOTION: batch["next", keys.MOTION], keys.SKILL: batch["next", keys.SKILL]}, batch.shape)
-        style = functional.imitation_reward(parts.discriminator(seen.flatten())[keys.DISCRIMINATOR_LOGIT])
-        seconds = parts.env.dt * cfg.env.decision_steps
-        rewards["imitation"] = cfg.reward.imitation * seconds * style.reshape(*batch.shape, 1)
-    batch["next", "reward"] = torch.stack(tuple(rewards.values())).sum(0)
-    return {f"reward/{name}": value.mean() for name, value in rewards.items()}
+    after, task = batch["next"], cfg.reward.task * batch["next", "reward"]
+    after["reward"] = task
+    metrics = {"reward/task": task.mean()}
+    if parts.imitation is not None:
+        metrics["reward/imitation"] = (parts.imitation(after)["reward"] - task).mean()
+    return metrics
 
 
 def value_finished(batch: TensorDictBase, value: float | None) -> None:

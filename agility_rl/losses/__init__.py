@@ -6,6 +6,7 @@ from agility_rl.losses.adaptation import AdaptationLoss, StateEstimationLoss
 from agility_rl.losses.byol import BYOLLoss
 from agility_rl.losses.discriminator import DiscriminatorLoss
 from agility_rl.losses.hybrid_ppo import HybridPPOLoss
+from agility_rl.losses.imitation_reward import ImitationReward
 from agility_rl.losses.predictor import PredictorLoss
 from agility_rl.losses.student import StudentLoss
 from agility_rl.losses.transition_discriminator import TransitionDiscriminatorLoss
@@ -15,6 +16,7 @@ __all__ = [
     "BYOLLoss",
     "DiscriminatorLoss",
     "HybridPPOLoss",
+    "ImitationReward",
     "PredictorLoss",
     "StateEstimationLoss",
     "StudentLoss",
