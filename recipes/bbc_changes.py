@@ -35,6 +35,10 @@ def check(cfg: Config) -> None:
         later = [value for _, option, value in cfg.changes if option.replace("-", "_") == f"env.{name}"]
         if bad := [value for value in (getattr(cfg.env, name), *later) if not least <= value <= most]:
             raise ValueError(f"--env.{name.replace('_', '-')}: expected {expected}, got {bad[0]}")
+    if cfg.env.lowest_box > cfg.env.highest_box:
+        raise ValueError(
+            f"--env.lowest-box: expected at most --env.highest-box, {cfg.env.highest_box}, got {cfg.env.lowest_box}"
+        )
     if cfg.env.shares and (
         len(cfg.env.shares) != len(BEHAVIOURS) or min(cfg.env.shares) < 0 or not sum(cfg.env.shares)
     ):

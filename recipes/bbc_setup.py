@@ -108,9 +108,9 @@ def build(cfg: Config) -> Components:
         Artifact.load(cfg.init_from, kind="bbc").fill(anchor)
     critic_keys = [keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.COMMAND, keys.PEAK]
     critic_keys += [keys.HISTORY] if ppo.critic_history else []
-    critic_keys += (
-        [keys.ENCOUNTER] if env.encounters is not None else []
-    )  # else its every judgement waits for the stumble
+    # Who is not told of what lies in the way judges a robot only when it stumbles.
+    met = [] if env.encounters is None else [keys.ENCOUNTER]
+    critic_keys += met
     width = sum(env.observation_spec[key].shape[1:].numel() for key in critic_keys)
     critic = Critic(width, in_keys=critic_keys, hidden=ppo.hidden).to(device)
     mean, deviation = dataset.statistics()
@@ -166,7 +166,7 @@ def build(cfg: Config) -> Components:
                 keys.HISTORY,
             ),
             *(keys.SKILL, keys.SHIFT, keys.ACTION, "action_log_prob", "loc", "scale"),
-            *([keys.ENCOUNTER] if env.encounters is not None else []),
+            *met,
         ],
         keep_next=["reward", keys.MOTION, keys.REWARD_TERMS],
         value=lambda observation: critic(observation.select(*critic_keys))["state_value"],

@@ -229,17 +229,17 @@ class LocomotionEnv(EnvBase):
         state = self.robots.state(action, self.commands)
         if self.rhythm is not None:
             state.rhythm = self.rhythm.update(state, self.commands.skill)
-        if self.encounters is not None:
+        boxes = self.encounters if self.encounters is not None and self.encounters.boxes else None
+        if boxes is not None:
             feet = rotations.rotate(self.simulator.root_quaternion[:, None], state.feet)
-            state.low_feet = self.encounters.low_feet(feet + self.simulator.root_position[:, None])
+            state.low_feet = boxes.low_feet(feet + self.simulator.root_position[:, None])
         terms = torch.stack([term.weight * self.dt * term.function(state) for term in self.rewards.values()], -1)
         terms = terms.masked_fill(state.unstable[:, None], 0.0)
         reward = terms.sum(-1, keepdim=True).clamp(min=0.0)
         terminated = torch.stack([failed(state) for failed in self.terminations]).any(0)[:, None]
         truncated = ((self._step_count >= self.max_steps) | self._at_edge())[:, None] & ~terminated
 
-        held = None if self.encounters is None else self.encounters.holding(self.simulator, self.commands)
-        self.commands.advance(held)
+        self.commands.advance(None if boxes is None else boxes.holding(self.simulator, self.commands))
         if self.encounters is not None:
             self.encounters.advance(self.simulator, self.commands)
         self.observations.update(state)

@@ -199,6 +199,7 @@ def test_options_change_at_their_iterations(module: Callable[[str], ModuleType])
         (("--trials.seconds", "1.5"), "--trials.seconds: expected at least 2, got 1.5"),
         (("--env.boxes", "-1"), "--env.boxes: expected a share from 0 to 1, got -1.0"),
         (("--changes", "3", "env.highest-box", "2"), "--env.highest-box: expected a height of boxes [m], got 2.0"),
+        (("--env.lowest-box", "0.4"), "--env.lowest-box: expected at most --env.highest-box, 0.3, got 0.4"),
         (("--env.shares", "1", "0"), "--env.shares: expected 5 numbers, none below 0, got (1.0, 0.0)"),
         (("--env.encounters", "1.5"), "encounters: expected a share from 0 to 1, got 1.5"),
     ],
