@@ -191,9 +191,8 @@ CPU = Config(
     byol=False,
     precision="auto",
     memory=256,
-    encoder_channels=(32, 24),
-    encoder_hidden=64,
-    encoder_features=64,
+    encoder_channels=(16, 32, 64, 96),
+    encoder_features=128,
     heading_gate=4.0,
     env=EnvConfig(num_robots=64, randomize=False, push_interval=None, command_noise=(0.97, 1.03), start_spread=2.0),
     imitation=ImitationConfig(
