@@ -41,6 +41,8 @@ class Config:
     """Run or artifact folder of its teacher."""
     bbc: Path | None = None
     """Run or artifact folder of the Basic Behaviour Controller of both; found by default."""
+    course: str | None = None
+    """Preset or file; its teacher's by default. In one with other walls an encoder learns not to go by them."""
     name: str = "images"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
@@ -70,7 +72,7 @@ def collect(cfg: Config) -> TensorDictBase:
     """Walk and look: :func:`glances.asked`, ``[T, N]``."""
     student = load_trained(cfg.student, "student").network.settings
     sizes = ("memory", "encoder_channels", "encoder_hidden", "encoder_features")
-    env = replace(CPU.env, num_robots=cfg.num_robots, num_threads=cfg.num_threads, start_spread=cfg.start_spread)
+    own = {name: getattr(cfg, name) for name in ("course", "num_robots", "num_threads", "start_spread")}
     run, trained = resolve(
         replace(
             CPU,
@@ -78,7 +80,7 @@ def collect(cfg: Config) -> TensorDictBase:
             bbc=cfg.bbc,
             init_from=cfg.student,
             seed=cfg.seed,
-            env=env,
+            env=replace(CPU.env, **own),
             **{name: student[name] for name in sizes},
         )
     )

@@ -12,6 +12,7 @@ from torch import Tensor
 from agility_rl.envs.randomization import uniform
 from agility_rl.go2 import camera
 from agility_rl.simulation import Simulator
+from agility_rl.tensors import rows_of
 
 
 class DepthObservation:
@@ -82,9 +83,9 @@ class DepthObservation:
         self._late = torch.where(mask, late, self._late)
         self._step = self._step.masked_fill(mask, 0)
         self.camera.set_pitch(mask, pitch)
-        first = self._take(mask)
-        self._frames[mask] = first[:, None]
-        self._taken[mask] = -self.latency[1]
+        rows, first = rows_of(mask), self._take(mask)[:, None]
+        self._frames[rows] = torch.where(mask[rows, None, None, None], first, self._frames[rows])
+        self._taken = self._taken.masked_fill(mask[:, None], -self.latency[1])
 
     def advance(self) -> None:
         """Count a control step of every robot, and take the frames that an observation will show."""
@@ -93,11 +94,12 @@ class DepthObservation:
         # between. An observation every `decision_steps` looks `_late` steps back, at frames every `frame_steps`.
         until = -(self._step + self._late) % self.decision_steps
         due = (self._step % self.frame_steps == 0) & (until < self.frame_steps)
-        if not bool(due.any()):
-            return
-        frame = self._take(due)
-        self._frames[due] = torch.cat((self._frames[due, 1:], frame[:, None]), 1)
-        self._taken[due] = torch.cat((self._taken[due, 1:], self._step[due, None]), 1)
+        if len(rows := rows_of(due)):
+            frames = self._frames[rows]
+            newer = torch.cat((frames[:, 1:], self._take(due)[:, None]), 1)
+            self._frames[rows] = torch.where(due[rows, None, None, None], newer, frames)
+            taken = torch.cat((self._taken[:, 1:], self._step[:, None]), 1)
+            self._taken = torch.where(due[:, None], taken, self._taken)
 
     def image(self) -> Tensor:
         """What the robots see, normalised, ``[N, 58, 87]``."""
@@ -106,7 +108,7 @@ class DepthObservation:
         return self._frames[torch.arange(len(index), device=index.device), index]
 
     def _take(self, mask: Tensor) -> Tensor:
-        """Normalised frames ``[M, 58, 87]`` of the rows of a bool mask."""
+        """Normalised frames ``[M, 58, 87]`` of :func:`~agility_rl.tensors.rows_of` a bool mask."""
         depth = self.camera.render(mask)
         if self.offset_noise or self.pixel_noise:
             # Drawn for every robot, whoever's frame is due, so that one robot's noise does not depend on the others.
@@ -114,7 +116,7 @@ class DepthObservation:
             offset, scale = uniform((2, n, 1, 1), (0.0, 1.0), self.generator)
             pixel = uniform((n, *depth.shape[1:]), (-1.0, 1.0), self.generator)
             noise = self.offset_noise * (2.0 * offset - 1.0) + self.pixel_noise * scale * pixel
-            depth = depth + noise[mask]
+            depth = depth + noise[rows_of(mask)]
         return camera.normalize_depth(depth)
 
     def state_dict(self) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from agility_rl.go2.camera import dequantize
 from agility_rl.keys import DEPTH
+from agility_rl.tensors import rows_of
 
 LOWEST, HIGHEST = -0.5, 0.5
 """Range of normalised images."""
@@ -104,10 +105,11 @@ class DepthAugmentation(TensorDictModuleBase):
             (self.dropout, self._drop_pixels),
             (self.blur, self._blur),
         ):
-            # Only the images that are chosen are touched, for most are not.
-            chosen = (self._uniform(len(flat)) < share).nonzero()[:, 0]
-            if len(chosen):
-                flat[chosen] = disturb(flat[chosen])
+            # On a CPU only the images that are chosen are touched, for most are not.
+            chosen = self._uniform(len(flat)) < share
+            if len(rows := rows_of(chosen)):
+                clean = flat[rows]
+                flat[rows] = torch.where(chosen[rows, None, None], disturb(clean), clean)
         return flat.clamp(LOWEST, HIGHEST).reshape(images.shape)
 
     def _uniform(self, *shape: int) -> Tensor:

@@ -14,6 +14,7 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from agility_rl.go2 import camera
+from agility_rl.tensors import rows_of
 
 CAMERA = "depth"
 FORWARD = (0.5, 0.5, -0.5, -0.5)  # looks along +x of the trunk, image right is -y, image up is +z
@@ -99,18 +100,18 @@ class DepthCamera:
         self._batch.expand("cam_quat")[:, self.model.camera(CAMERA).id] = turned
 
     def render(self, mask: Tensor) -> Tensor:
-        """Depth images of the M rows of a bool mask ``[N]``, as their robots stand now.
+        """Depth images of the M rows (:func:`~agility_rl.tensors.rows_of`) of a bool mask ``[N]``, as robots stand now.
 
         Returns:
             float32 ``[M, 58, 87]``, distance along the optical axis [m]; infinite where nothing is.
         """
-        rows = mask.numpy()
+        rows = rows_of(mask).numpy()
         shape = (camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)
-        if not rows.any():
+        if not len(rows):
             return torch.zeros(0, *shape)
         for own, source in self._poses:
             own[rows] = source[rows]
         # Sensors of the position stage belong to what this stage comes after.
-        self._batch.forward(rows, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._batch.forward(mask.numpy(), stage=mujoco.mjtStage.mjSTAGE_VEL)
         depth = torch.from_numpy(self._depth[rows].astype(np.float32)).unflatten(-1, shape)
         return torch.where(depth < 0.0, torch.inf, depth)

@@ -13,12 +13,13 @@ from agility_rl.go2 import camera
 from agility_rl.rotations import multiply
 from agility_rl.simulation.depth_camera import CAMERA, FORWARD, camera_spec
 from agility_rl.simulation.warp_device import mjw, on_device, wp
+from agility_rl.tensors import rows_of
 
 
 class WarpDepthCamera:
     """The D435i of ``N`` simulated robots, as :class:`agility_rl.simulation.DepthCamera`.
 
-    Images of all robots are rendered, and those that are asked for returned.
+    Images of all robots are rendered; on a GPU all are returned too, else those that are asked for.
 
     Source: pose, size and field of view: :mod:`agility_rl.go2.camera`.
 
@@ -71,7 +72,7 @@ class WarpDepthCamera:
         self._quaternion.copy_(multiply(turn, self._forward.expand_as(turn)))
 
     def render(self, mask: Tensor) -> Tensor:
-        """Depth images of the M rows of a bool mask ``[N]``, as their robots stand now.
+        """Depth images of the M rows (:func:`~agility_rl.tensors.rows_of`) of a bool mask ``[N]``, as robots stand now.
 
         Returns:
             float32 ``[M, 58, 87]``, distance along the optical axis [m]; infinite where nothing is.
@@ -84,5 +85,5 @@ class WarpDepthCamera:
             mjw.camlight(self._model, self._data)
             mjw.refit_bvh(self._model, self._data, self._context)
             mjw.render(self._model, self._data, self._context)
-        depth = self._image[mask].unflatten(-1, (camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH))
+        depth = self._image[rows_of(mask)].unflatten(-1, (camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH))
         return torch.where(depth <= 0.0, math.inf, depth)

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import Tensor
 
+from agility_rl import tensors
 from agility_rl.go2.camera import quantize
-from agility_rl.modules import DepthAugmentation
+from agility_rl.modules import DepthAugmentation, depth_augmentation
 from agility_rl.modules.depth_augmentation import gaussian_blur
 
 NONE = {"rectangle": 0.0, "white_noise": 0.0, "dropout": 0.0, "blur": 0.0}
@@ -57,7 +60,11 @@ def test_blur_by_hand(generator: torch.Generator) -> None:
     torch.testing.assert_close(only(generator, blur=1.0).augment(flat), flat)  # edges are repeated, not black
 
 
-def test_each_image_draws_for_itself_with_the_given_probability(generator: torch.Generator) -> None:
+@pytest.mark.parametrize("rows_of", [tensors.rows_of, lambda mask: torch.arange(len(mask))], ids=["CPU", "as on a GPU"])
+def test_each_image_draws_for_itself_with_the_given_probability(
+    generator: torch.Generator, monkeypatch: pytest.MonkeyPatch, rows_of: Callable[[Tensor], Tensor]
+) -> None:
+    monkeypatch.setattr(depth_augmentation, "rows_of", rows_of)
     images = torch.rand(2000, 12, 16, generator=generator) * 0.8 - 0.4
     for name in NONE:
         out = only(generator, **{name: 0.25}).augment(images)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import torch
 from safetensors.torch import load_file
 
 from agility_rl.deploy.artifact import Artifact
+from agility_rl.envs import COURSES
 from agility_rl.modules import RecurrentStudent
 
 Module = Callable[[str], ModuleType]
@@ -34,6 +36,30 @@ def images(module: Module, student: Any, tmp_path: Path) -> Path:
     run = module("tsc_student").train(student)
     options = {"student": run, "teacher": student.teacher, "bbc": student.bbc, "runs": tmp_path}
     return recipe.main(recipe.Config(**options, windows=1, num_robots=4))
+
+
+@pytest.fixture
+def wider(student: Any, tmp_path: Path) -> Path:
+    """The student's course between walls that stand elsewhere, and taller."""
+    course = COURSES[student.env.course or Artifact.load(student.teacher / "policy", kind="teacher").manifest["course"]]
+    slots = "".join(
+        f'[[slots]]\nobstacle = "{slot.obstacle}"\nposition = {list(slot.position)}\n'
+        f"yaw_degrees = {math.degrees(slot.yaw)}\n"
+        for slot in course.slots
+    )
+    path = tmp_path / "wider.toml"
+    size = [side + 1.5 for side in course.size]
+    path.write_text(f'name = "wider"\nsize = {size}\nwall_height = [3.0, 5.0]\n{slots}', encoding="utf-8")
+    return path
+
+
+def test_images_between_other_walls(module: Module, images: Path, student: Any, wider: Path, tmp_path: Path) -> None:
+    recipe = module("tsc_images")
+    options = {"student": tmp_path / "student", "teacher": student.teacher, "bbc": student.bbc, "runs": tmp_path}
+    other = recipe.main(recipe.Config(**options, course=str(wider), name="other", windows=1, num_robots=4))
+    here, there = (load_file(folder / "images.safetensors")["depth"][:, :, 0] for folder in (images, other))
+    sky, walls = ((upper == 255).float().mean() for upper in (here, there))
+    assert walls < sky - 0.05  # walls where the sky was
 
 
 def options_of(folder: Path, **others: Any) -> dict[str, Any]:
