@@ -59,7 +59,8 @@ class Camera(Protocol):
         ...
 
     def render(self, mask: Tensor) -> Tensor:
-        """Distances along the optical axis [m], ``[M, 58, 87]``, of the M rows of a mask; infinite where nothing is."""
+        """Distances along the optical axis [m], ``[M, 58, 87]``, of the M rows (:func:`~agility_rl.tensors.rows_of`) of
+        a mask; infinite where nothing is."""
         ...
 
 
