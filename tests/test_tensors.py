@@ -47,7 +47,7 @@ def locomotion() -> list[Tensor]:
 
 
 def course() -> list[Tensor]:
-    depth = {"latency": (1, 4)}  # so that frames of some robots are due in every step, and not of all
+    depth = {"frame_steps": 3, "latency": (1, 4)}  # so that frames of all, of some and of no robots are due
     env = AgilityEnv(12, hold, decision_steps=2, episode_length=0.3, seed=3, depth=depth)
     torch.manual_seed(3)
     td = env.rollout(20, break_when_any_done=False)

@@ -94,12 +94,15 @@ class DepthObservation:
         # between. An observation every `decision_steps` looks `_late` steps back, at frames every `frame_steps`.
         until = -(self._step + self._late) % self.decision_steps
         due = (self._step % self.frame_steps == 0) & (until < self.frame_steps)
-        if len(rows := rows_of(due)):
-            frames = self._frames[rows]
-            newer = torch.cat((frames[:, 1:], self._take(due)[:, None]), 1)
-            self._frames[rows] = torch.where(due[rows, None, None, None], newer, frames)
-            taken = torch.cat((self._taken[:, 1:], self._step[:, None]), 1)
-            self._taken = torch.where(due[:, None], taken, self._taken)
+        # A GPU is waited for where that can spare it the images of all robots, and only there.
+        if max(self.decision_steps, self.frame_steps) > 1 and not bool(due.any()):
+            return
+        rows = rows_of(due)
+        frames = self._frames[rows]
+        newer = torch.cat((frames[:, 1:], self._take(due)[:, None]), 1)
+        self._frames[rows] = torch.where(due[rows, None, None, None], newer, frames)
+        taken = torch.cat((self._taken[:, 1:], self._step[:, None]), 1)
+        self._taken = torch.where(due[:, None], taken, self._taken)
 
     def image(self) -> Tensor:
         """What the robots see, normalised, ``[N, 58, 87]``."""
