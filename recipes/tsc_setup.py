@@ -103,6 +103,7 @@ def build(cfg: Config) -> Components:
         cfg.env.decision_steps,
         simulator_options(cfg, cfg.env.num_threads),
         fastest_canter=cfg.env.fastest_canter,
+        misjudgement=cfg.env.misjudgement,
         seed=seeds.integer("environment"),
         motion_offsets=offsets,
         rewards=rewards(cfg.reward),

@@ -22,6 +22,7 @@ from agility_rl.envs.course_presets import full_course
 from agility_rl.envs.decisions import COMMAND_NOISE, NUM_PARAMETERS, Decisions
 from agility_rl.envs.depth import DepthObservation
 from agility_rl.envs.layout import scenery
+from agility_rl.envs.misjudgement import Misjudgement
 from agility_rl.envs.observations import ObservationGroups
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.envs.outcome import DecisionOutcome, outcome_specs
@@ -80,6 +81,8 @@ class AgilityEnv(EnvBase):
         start: before a random obstacle, or before the first.
         start_spread: how many times as far aside and turned as released (:class:`~agility_rl.envs.arena.Arena`).
         start_after: share of random starts that are where the obstacle before is left.
+        misjudgement: factor on how wrong ``place`` and ``heading_error`` are
+            (:class:`~agility_rl.envs.misjudgement.Misjudgement`; ours); 0: they are true.
         push_interval: seconds between pushes; ``None`` for none.
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
         motion_offsets: which discriminator frames ``motion`` holds, in control steps from the oldest.
@@ -121,6 +124,7 @@ class AgilityEnv(EnvBase):
         start: Literal["random", "first"] = "random",
         start_spread: float = 1.0,
         start_after: float = 0.0,
+        misjudgement: float = 0.0,
         push_interval: float | None = None,
         push_velocity: float = 0.5,
         motion_offsets: Sequence[int] = features.MOTION_OFFSETS,
@@ -136,7 +140,9 @@ class AgilityEnv(EnvBase):
         self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
         self.simulator = simulator
         self.generator = torch.Generator(simulator.device).manual_seed(seed)
-        self.arena = Arena(course, num_robots, self.generator, goal_radius, start, start_spread, start_after)
+        period = simulator.control_dt * decision_steps
+        errors = Misjudgement(num_robots, self.generator, misjudgement, period) if misjudgement else None
+        self.arena = Arena(course, num_robots, self.generator, goal_radius, start, start_spread, start_after, errors)
         if self.simulator.num_simulations != num_robots:
             raise ValueError(f"the simulator holds {self.simulator.num_simulations} robots, expected {num_robots}")
         if tuple(self.simulator.scenery) != pieces:
@@ -248,6 +254,7 @@ class AgilityEnv(EnvBase):
         outcome = self._outcome()
         for _ in range(self.decision_steps):
             self._advance(outcome)
+        self.arena.advance()
         return self._observe(outcome)
 
     def _outcome(self) -> DecisionOutcome:

@@ -12,6 +12,7 @@ from torch import Tensor
 from agility_rl import keys, rotations
 from agility_rl.envs.course import Course
 from agility_rl.envs.layout import CourseLayout
+from agility_rl.envs.misjudgement import Misjudgement
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.envs.progress import GOAL_RADIUS, CourseProgress
 from agility_rl.envs.robots import CLEARANCE
@@ -42,6 +43,7 @@ class Arena:
         start_after: share of random starts that are where the obstacle before is left, so that robots come to the
             next as on the whole course (turned away from it in an S, say), and not straight from a stand before it.
         start_spread: how many times as far aside and turned as released; 4 covers how robots leave the obstacle before.
+        misjudgement: how wrong what robots are told of their place and of directions is; ``None``: not at all.
 
     Attributes:
         layout: where the obstacles stand.
@@ -64,6 +66,7 @@ class Arena:
         start: Literal["random", "first"] = "random",
         start_spread: float = 1.0,
         start_after: float = 0.0,
+        misjudgement: Misjudgement | None = None,
     ) -> None:
         if start not in ("random", "first"):
             raise ValueError(f"expected start 'random' or 'first', got {start!r}")
@@ -72,7 +75,7 @@ class Arena:
         if not 0.0 <= start_spread <= 10.0:
             raise ValueError(f"start_spread must be from 0 to 10, got {start_spread}")
         self.generator, self.random_start, self.start_spread = generator, start == "random", start_spread
-        self.start_after = start_after
+        self.start_after, self.misjudgement = start_after, misjudgement
         self.layout = CourseLayout(course, num_robots, generator)
         self.progress = CourseProgress(self.layout, goal_radius)
         self.scan = HeightScan(self.layout)
@@ -139,6 +142,22 @@ class Arena:
             joint_velocity=torch.zeros(n, constants.NUM_JOINTS, device=device),
         )
         self.progress.locate(mask, place)
+        if self.misjudgement is not None:
+            self.misjudgement.begin(mask)
+
+    def advance(self) -> None:
+        """One decision later."""
+        if self.misjudgement is not None:
+            self.misjudgement.advance()
+
+    def believed(self, position: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor]:
+        """Where robots at ``[N, 2]`` [m] with headings ``[N]`` [rad] are told that they are."""
+        if self.misjudgement is None:
+            return position, yaw
+        obstacle = self.progress.obstacle
+        axis = self.layout.yaw.gather(1, obstacle[:, None])[:, 0]
+        local, turned = self.misjudgement.misjudged(self.layout.local_to(obstacle, position), yaw - axis)
+        return self.layout.world(obstacle, local), axis + turned
 
     def _stand(self, leg: Tensor) -> tuple[Tensor, Tensor]:
         """Obstacle by which the robots of legs ``[N]`` start, and where in its frame, int64 ``[N]`` and ``[N, 2]``."""
@@ -179,11 +198,11 @@ class Arena:
     def observe(self, simulator: Simulator, yaw: Tensor) -> TensorDict:
         """What the Task-Specific Controller sees of the course, ``[N]``."""
         parameter = self.layout.parameter(simulator.hinge_angle)
-        position = simulator.root_position[:, :2]
+        believed = self.believed(simulator.root_position[:, :2], yaw)
         return TensorDict(
             {
-                keys.HEADING_ERROR: self.heading_error(position, yaw)[1],
-                keys.PLACE: self.place(position, yaw),
+                keys.HEADING_ERROR: self.heading_error(*believed)[1],
+                keys.PLACE: self.place(*believed),
                 keys.OBSTACLE: self.types[self.progress.obstacle].float(),
                 keys.PROGRESS: torch.nn.functional.one_hot(self.progress.stage, self.progress.num_stages).float(),
                 keys.SCANDOTS: self.scan.scandots(simulator.root_position, yaw, parameter),
@@ -198,6 +217,7 @@ class Arena:
             "progress": self.progress.state_dict(),
             "max_obstacles": self.max_obstacles,
             "start_weights": self.start_weights.clone(),
+            **({} if self.misjudgement is None else {"misjudgement": self.misjudgement.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -206,3 +226,5 @@ class Arena:
         self.progress.load_state_dict(state["progress"])
         self.max_obstacles = state["max_obstacles"]
         self.start_weights = state["start_weights"].clone()
+        if self.misjudgement is not None:
+            self.misjudgement.load_state_dict(state["misjudgement"])

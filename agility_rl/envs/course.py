@@ -84,6 +84,7 @@ class Course:
         routes: orders in which slots are passed, by index; every episode draws one. Empty: all slots as listed.
         shuffle: draw anew for every robot which obstacle stands in which slot.
         wall_height: lowest and highest top of the walls [m]; ``None`` for an open field.
+        wall_distance: by how much each wall stands farther out than the arena ends, at least and at most [m].
 
     Raises:
         CourseError: if the course cannot be built.
@@ -100,6 +101,7 @@ class Course:
     routes: tuple[tuple[int, ...], ...] = ()
     shuffle: bool = False
     wall_height: tuple[float, float] | None = (WALL_HEIGHT, WALL_HEIGHT)
+    wall_distance: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not self.slots:
@@ -114,6 +116,10 @@ class Course:
         if walls is not None and not 0.0 < walls[0] <= walls[1] <= TALLEST_WALL:
             raise CourseError(
                 f"course {self.name!r}: wall_height must be (low, high) in 0 to {TALLEST_WALL} m, got {walls}"
+            )
+        if not 0.0 <= self.wall_distance[0] <= self.wall_distance[1] < math.inf:
+            raise CourseError(
+                f"course {self.name!r}: wall_distance must be (low, high), 0 m or more, got {self.wall_distance}"
             )
         self._check_routes()
         self._check_places()

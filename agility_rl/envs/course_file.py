@@ -18,8 +18,8 @@
     yaw_degrees = 90.0
     way_points = [[-1.5, 0.0], [1.0, 0.0], [1.5, 0.0]]
 
-Further names: ``shuffle = true``, ``routes = [[0, 1], [1, 0]]``, ``wall_height = [0.5, 5.0]``, ``open = true`` for no
-walls.
+Further names: ``shuffle = true``, ``routes = [[0, 1], [1, 0]]``, ``wall_height = [0.5, 5.0]``,
+``wall_distance = [0.0, 2.0]``, ``open = true`` for no walls.
 """
 
 from __future__ import annotations
@@ -181,5 +181,6 @@ _COURSE: dict[str, tuple[str, Reader]] = {
     "routes": ("routes", _routes),
     "shuffle": ("shuffle", _flag),
     "wall_height": ("wall_height", _pair),
+    "wall_distance": ("wall_distance", _pair),
     "open": ("open", _flag),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from agility_rl.envs.course import Course, CourseError, Jitter, Slot
 from agility_rl.envs.obstacles import OBSTACLES
@@ -13,6 +14,8 @@ ARENA = (7.0, 10.0)
 """Size of the arena [m] (method notes, section 5.7)."""
 JITTER = Jitter(0.25, 0.15, math.radians(5.0))
 """Half-widths [m, m, rad] (section 5.7)."""
+CAMERA_WALLS = (0.5, 5.0)
+"""Lowest and highest top of the walls where there is a camera [m] (section 5.7)."""
 
 _UP, _DOWN = math.pi / 2, -math.pi / 2
 _S_ROUTE = ((5.5, 3.0, _UP), (5.5, 7.0, _UP), (3.5, 7.0, _DOWN), (3.5, 3.0, _DOWN), (1.5, 3.0, _UP), (1.5, 7.0, _UP))
@@ -26,6 +29,17 @@ def full_course(wall_height: tuple[float, float] = (0.72, 0.72)) -> Course:
     """
     slots = tuple(Slot(name, (x, y), yaw, JITTER) for name, (x, y, yaw) in zip(CHALLENGE, _S_ROUTE, strict=True))
     return Course("full", ARENA, slots, shuffle=True, wall_height=wall_height)
+
+
+def full_course_for_cameras() -> Course:
+    """The challenge between walls that no camera can go by: of any height, each up to two metres farther out.
+
+    Where all images are taken in one arena, an encoder learns where its walls are, which say where an obstacle should
+    stand and not where it does.
+
+    Source: heights: method notes, section 5.7; distances: ours.
+    """
+    return replace(full_course(CAMERA_WALLS), name="full_walls", wall_distance=(0.0, 2.0))
 
 
 def single_course(obstacle: str) -> Course:
@@ -76,6 +90,7 @@ COURSES: dict[str, Course] = {
     course.name: course
     for course in (
         full_course(),
+        full_course_for_cameras(),
         *(single_course(name) for name in CHALLENGE),
         box_course(),
         hurdle_course(),

@@ -12,8 +12,9 @@ from agility_rl.envs.obstacles import SEESAW_TILT
 from agility_rl.simulation import Piece, Shape
 
 _WALL = 0.05
+_OUTWARDS = ((0.0, -1.0), (0.0, 1.0), (-1.0, 0.0), (1.0, 0.0))
 """Half thickness of a wall [m] (ours)."""
-_BUFFERS = ("position", "yaw", "lift", "route", "length", "first_leg", "wall_height")
+_BUFFERS = ("position", "yaw", "lift", "route", "length", "first_leg", "wall_height", "wall_distance")
 
 
 class CourseLayout:
@@ -38,6 +39,8 @@ class CourseLayout:
         length: int64 ``[N]``, number of valid entries in a row of :attr:`route`.
         first_leg: int64 ``[N]``, how many obstacles are in the routes that the course lists before the row's.
         wall_height: ``[N]`` [m].
+        wall_distance: ``[N, 4]``, how much farther out than the arena's edges at low y, high y, low x and high x they
+            stand [m].
         difficulty: share of every range of heights that is drawn from, 0 to 1; assign for a curriculum.
 
     Example:
@@ -60,6 +63,7 @@ class CourseLayout:
         hinged = [index for index, number in owners if self.kinds[index].pieces[number].hinge is not None]
         self._hinged = torch.tensor(hinged, dtype=torch.int64, device=device)  # obstacle of each hinge
         self._middles = torch.tensor(_wall_middles(course), device=device)
+        self._outwards = torch.tensor(_OUTWARDS, device=device)
         self._upright = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device)
 
         self._place = torch.tensor([(*slot.position, slot.yaw) for slot in course.slots], device=device)
@@ -70,7 +74,7 @@ class CourseLayout:
         self._routes = torch.tensor(routes, device=device)
         self._lengths = torch.tensor([len(route) for route in course.routes], device=device)
         self._first_legs = self._lengths.cumsum(0) - self._lengths
-        self._wall_range = course.wall_height or (0.0, 0.0)
+        self._wall_range, self._wall_distances = course.wall_height or (0.0, 0.0), course.wall_distance
 
         self.difficulty = 1.0
         self.position = self._place[:, :2].repeat(n, 1, 1)
@@ -80,6 +84,7 @@ class CourseLayout:
         self.length = self._lengths[0].repeat(n)
         self.first_leg = self._first_legs[0].repeat(n)
         self.wall_height = torch.full((n,), self._wall_range[0], device=device)
+        self.wall_distance = torch.full((n, len(_OUTWARDS)), self._wall_distances[0], device=device)
 
     def draw(self, mask: Tensor) -> None:
         """Draw the rows of a bool mask ``[N]`` anew."""
@@ -96,8 +101,11 @@ class CourseLayout:
         choice = torch.randint(len(self._routes), (n,), generator=self.generator, device=self.device)
         route = slot.argsort(-1).gather(1, self._routes[choice])  # slots, then the obstacles that stand there
         walls = self._wall_range[0] + (self._wall_range[1] - self._wall_range[0]) * uniform(n)
+        near, far = self._wall_distances
+        distance = near + (far - near) * uniform(*self.wall_distance.shape) if far > near else self.wall_distance
         # New tensors, because observations of earlier steps may still refer to the old ones.
-        drawn = (place[..., :2], place[..., 2], lift, route, self._lengths[choice], self._first_legs[choice], walls)
+        which = (route, self._lengths[choice], self._first_legs[choice])
+        drawn = (place[..., :2], place[..., 2], lift, *which, walls, distance)
         for name, value in zip(_BUFFERS, drawn, strict=True):
             rows = mask.view(-1, *(1,) * (value.ndim - 1))
             setattr(self, name, torch.where(rows, value, getattr(self, name)))
@@ -116,7 +124,7 @@ class CourseLayout:
         zero = torch.zeros_like(half)
         quaternion = torch.stack((half.cos(), zero, zero, half.sin()), -1)
         if walls := len(self.pieces) - len(self._owner):
-            middle = self._middles.repeat(n, 1, 1)
+            middle = self._middles + self._outwards * self.wall_distance[..., None]
             sunk = (self.wall_height - TALLEST_WALL / 2)[:, None, None].expand(n, walls, 1)
             position = torch.cat((position, torch.cat((middle, sunk), -1)), 1)
             upright = self._upright.repeat(n, walls, 1)
@@ -195,8 +203,8 @@ def _walls(course: Course) -> tuple[Piece, ...]:
     """Four pieces as tall as the tallest wall; how far they are sunk makes their height."""
     if course.wall_height is None:
         return ()
-    x, y = course.size
-    sizes = [(x / 2 + 2 * _WALL, _WALL)] * 2 + [(_WALL, y / 2)] * 2
+    (x, y), farther = course.size, course.wall_distance[1]
+    sizes = [(x / 2 + farther + 2 * _WALL, _WALL)] * 2 + [(_WALL, y / 2 + farther)] * 2
     colour = (0.75, 0.78, 0.8, 1.0)
     return tuple(
         Piece(f"wall_{index}", (Shape("box", (*half, TALLEST_WALL / 2), colour=colour),))

@@ -110,10 +110,12 @@ class HeightScan:
 
     def _with_walls(self, heights: Tensor, position: Tensor, yaw: Tensor) -> Tensor:
         rim = self._ahead + self._radius
-        near = ((position < rim) | (position > self._size - rim)).any(-1)
+        low_y, high_y, low_x, high_x = self.layout.wall_distance.unbind(-1)
+        low, high = -torch.stack((low_x, low_y), -1), self._size + torch.stack((high_x, high_y), -1)
+        near = ((position < low + rim) | (position > high - rim)).any(-1)
         close = rows_of(near)
         points = _frame(yaw[close], position[close]) @ self._grid  # [M, 2, 132]
-        outside = ((points < 0.0) | (points > self._size[:, None])).any(1)
+        outside = ((points < low[close, :, None]) | (points > high[close, :, None])).any(1)
         wall = torch.where(outside, self.layout.wall_height[close, None], 0.0)
         return heights.index_copy_(0, close, torch.maximum(heights[close], wall))
 

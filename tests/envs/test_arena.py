@@ -11,6 +11,7 @@ import torch
 from agility_rl import keys, rotations
 from agility_rl.envs.arena import Arena
 from agility_rl.envs.course_presets import COURSES
+from agility_rl.envs.misjudgement import Misjudgement
 from agility_rl.simulation import BatchSimulator
 
 N = 60
@@ -191,3 +192,26 @@ def test_saved_arena_is_exact() -> None:
     assert torch.equal(other.progress.goal(), arena.progress.goal())
     assert other.max_obstacles == 3 and other.layout.difficulty == 0.5
     assert torch.equal(other.start_weights, arena.start_weights)
+
+
+def test_robots_that_misjudge_their_place_are_told_one_story() -> None:
+    arena, simulator = build(n=200, misjudgement=Misjudgement(200, torch.Generator(), 1.0, 0.04))
+    begin(arena, simulator)
+    yaw = rotations.to_euler(simulator.root_quaternion)[2]
+    position = simulator.root_position[:, :2]
+    seen = arena.observe(simulator, yaw)
+    place = seen[keys.PLACE]
+    assert not torch.allclose(place, arena.place(position, yaw), atol=0.05)
+    bearing = torch.atan2(place[:, [1, 3]], place[:, [0, 2]])
+    torch.testing.assert_close(bearing, seen[keys.HEADING_ERROR], atol=1e-4, rtol=0)
+    # Way-points are as far from each other as they are, and the present one lies where it does at the obstacle.
+    goals = torch.stack(arena.progress.goals(), 1)
+    apart = torch.linalg.vector_norm(goals[:, 0] - goals[:, 1], dim=-1)
+    torch.testing.assert_close(torch.linalg.vector_norm(place[:, :2] - place[:, 2:4], dim=-1), apart)
+    away = torch.linalg.vector_norm(arena.progress.local_goal() - place[:, 4:6], dim=-1)
+    torch.testing.assert_close(torch.linalg.vector_norm(place[:, :2], dim=-1), away, atol=1e-5, rtol=0)
+    state = arena.state_dict()
+    arena.advance()
+    assert not torch.equal(arena.observe(simulator, yaw)[keys.PLACE], place)
+    arena.load_state_dict(state)
+    assert torch.equal(arena.observe(simulator, yaw)[keys.PLACE], place)

@@ -63,6 +63,7 @@ def test_a_bad_slot_is_refused(slot: dict[str, object], message: str) -> None:
         ({"routes": ((0, 0),)}, "at most once"),
         ({"routes": ((1, 0),)}, r"from slot 1 \(tunnel\) to slot 0 \(bar_jump\) is "),
         ({"wall_height": (0.5, 9.0)}, "wall_height"),
+        ({"wall_distance": (-0.5, 1.0)}, "wall_distance must be"),
     ],
 )
 def test_a_bad_course_is_refused(changes: dict[str, object], message: str) -> None:

@@ -14,6 +14,7 @@ from agility_rl.envs.course_file import load_course
 TOML = """
 size = [4.0, 12.0]
 wall_height = [0.5, 5]
+wall_distance = [0, 1.5]
 routes = [[0, 1], [0]]
 
 [[slots]]
@@ -40,7 +41,7 @@ def write(folder: Path, text: str, name: str = "mine.toml") -> Path:
 def test_a_file_becomes_a_course(tmp_path: Path) -> None:
     course = load_course(write(tmp_path, TOML))
     assert course.name == "mine" and course.size == (4.0, 12.0) and not course.shuffle
-    assert course.wall_height == (0.5, 5.0) and course.routes == ((0, 1), (0,))
+    assert course.wall_height == (0.5, 5.0) and course.wall_distance == (0.0, 1.5) and course.routes == ((0, 1), (0,))
     hurdle, tunnel = course.slots
     assert hurdle.yaw == pytest.approx(math.pi / 2) and hurdle.heights == (0.10, 0.25)
     assert hurdle.jitter == pytest.approx((0.1, 0.0, math.radians(2.0)))

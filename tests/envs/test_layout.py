@@ -127,6 +127,32 @@ def test_obstacles_stand_in_the_simulator_where_the_layout_says() -> None:
     torch.testing.assert_close(parameter[:, names.index("seesaw")], torch.full((4,), math.tan(SEESAW_TILT)))
 
 
+def test_walls_may_stand_farther_out_in_every_episode_anew() -> None:
+    layout = drawn(COURSES["full_walls"], 300)
+    distance = layout.wall_distance
+    assert distance.min() >= 0.0 and 1.9 < distance.max() <= 2.0 and distance.std(0).min() > 0.4
+    assert torch.corrcoef(distance.T).fill_diagonal_(0.0).abs().max() < 0.3  # each wall by itself
+    simulator = BatchSimulator(300, num_threads=1, scenery=layout.pieces)
+    simulator.place(everyone(300), *layout.poses())
+    down = torch.tensor([0.0, 0.0, -1.0]).expand(300, 1, 3)
+    low_y, high_y, low_x, high_x = distance.unbind(-1)
+    middle, across = torch.full((300,), 3.5), torch.full((300,), 5.0)
+    faces = (
+        (middle, -low_y, 0, -1),
+        (middle, 10.0 + high_y, 0, 1),
+        (-low_x, across, -1, 0),
+        (7.0 + high_x, across, 1, 0),
+    )
+    for x, y, out_x, out_y in faces:
+        for beyond, stands in ((-0.02, False), (0.02, True)):
+            origin = torch.stack((x + beyond * out_x, y + beyond * out_y, torch.full((300,), 6.0)), -1)[:, None]
+            height = 6.0 - simulator.ray(origin, down)[:, 0]
+            torch.testing.assert_close(height, layout.wall_height if stands else torch.zeros(300), atol=1e-4, rtol=0)
+    mask = torch.arange(300) < 3
+    layout.draw(mask)
+    assert torch.equal((layout.wall_distance != distance).any(-1), mask)
+
+
 def test_two_obstacles_of_a_type_are_two() -> None:
     layout = drawn(COURSES["hurdles"], 3)
     assert len({piece.name for piece in layout.pieces}) == len(layout.pieces) == 8

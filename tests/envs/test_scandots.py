@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from agility_rl.envs.course import Course, Slot
-from agility_rl.envs.course_presets import full_course
+from agility_rl.envs.course_presets import COURSES, full_course
 from agility_rl.envs.layout import CourseLayout
 from agility_rl.envs.scandots import GRID_X, GRID_Y, NUM_SCANDOTS, HeightScan
 from agility_rl.simulation import BatchSimulator
@@ -66,6 +66,22 @@ def test_random_poses_against_rays() -> None:
     assert (miss > 0.01).float().mean() < 0.01  # rims: looked up to half a cell, 12.5 mm
     outside = ((points < 0.0) | (points > torch.tensor([7.0, 10.0]))).any(-1)
     assert outside.any() and (seen[outside] >= 0.72).all()  # behind a wall is wall
+
+
+def test_walls_are_seen_where_they_stand() -> None:
+    layout = lay(COURSES["full_walls"], 400)
+    generator = torch.Generator().manual_seed(1)
+    low_y, high_y, low_x, high_x = layout.wall_distance.unbind(-1)
+    low, high = -torch.stack((low_x, low_y), -1), torch.tensor([7.0, 10.0]) + torch.stack((high_x, high_y), -1)
+    place = low + torch.rand(400, 2, generator=generator) * (high - low)
+    yaw = 2.0 * math.pi * torch.rand(400, generator=generator)
+    seen = HeightScan(layout, neighbours=False).heights(place, yaw, layout.lift)
+    points = grid(place, yaw)
+    outside = ((points < low[:, None]) | (points > high[:, None])).any(-1)
+    assert outside.any(-1).sum() > 30
+    assert (seen >= layout.wall_height[:, None] - 1e-6)[outside].all()
+    free = ~outside & ((points < -0.5) | (points > torch.tensor([7.5, 10.5]))).any(-1)  # nothing stands out there
+    assert free.sum() > 100 and (seen[free] == 0.0).all()
 
 
 @pytest.mark.parametrize("name", ["bar_jump", "tire_jump", "tunnel", "box_jump", "a_frame", "weave_poles", "seesaw"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -160,11 +161,13 @@ def test_a_teacher_with_a_faster_canter_says_so_and_goes_on_as_fast_as_it_did(
 
 
 def test_options_of_the_course_reach_it(recipe: ModuleType, smoke: Any) -> None:
-    env = replace(smoke.env, goal_radius=0.45, start_spread=2.0, start_after=0.5)
+    env = replace(smoke.env, goal_radius=0.45, start_spread=2.0, start_after=0.5, misjudgement=0.5)
     reward = replace(smoke.reward, termination=-500.0, heading=0.25)
     parts = recipe.build(replace(smoke, env=env, reward=reward, ppo=replace(smoke.ppo, bounds=0.25)))
     assert parts.env.arena.progress.radius == 0.45
     assert (parts.env.arena.start_spread, parts.env.arena.start_after) == (2.0, 0.5)
+    errors = parts.env.arena.misjudgement
+    assert errors is not None and errors.kept == math.exp(-0.02 * env.decision_steps)
     assert parts.ppo.loss.bounds_coeff == 0.25 and "loss_bounds" in parts.ppo.loss.out_keys
     assert parts.env.termination_reward == -500.0 and parts.env.rewards["heading"].weight == 0.25
     parts.env.close()
