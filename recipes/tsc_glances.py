@@ -41,6 +41,8 @@ from agility_rl.training.seeding import seed_everything
 
 WARM_UP = 400
 """Steps in which the learning rate rises: the optimiser begins anew on weights that may be good already."""
+ENCODER = ("encoder_channels", "encoder_hidden", "encoder_features")
+"""Sizes of the encoder."""
 ROUND = 20
 """Steps between two looks at the clock."""
 
@@ -69,7 +71,9 @@ class Config:
     encoder_channels: tuple[int, ...] | None = None
     encoder_hidden: int | None = None
     encoder_features: int | None = None
-    """Other sizes than the student's: then encoder, glance and what reads them begin anew."""
+    glance_hidden: tuple[int, ...] | None = None
+    """Other sizes than the student's: then encoder, glance and what reads them begin anew, with the last one only what
+    says where obstacles are."""
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
     seed: int = 0
 
@@ -88,12 +92,13 @@ def resized(trained: Trained, cfg: Config) -> RecurrentStudent:
     """The student, with an encoder of other sizes if asked; every weight that still fits is kept."""
     network = trained.network
     assert isinstance(network, RecurrentStudent)
-    asked = {name: getattr(cfg, name) for name in ("encoder_channels", "encoder_hidden", "encoder_features")}
-    student = RecurrentStudent(**(network.settings | {name: size for name, size in asked.items() if size is not None}))
+    asked = {name: getattr(cfg, name) for name in (*ENCODER, "glance_hidden") if getattr(cfg, name) is not None}
+    student = RecurrentStudent(**(network.settings | asked))
     if student.settings == network.settings:
         return network
     state, known = student.state_dict(), network.state_dict()
-    anew = ("depth_encoder.", "memory.glance.")
+    same = all(student.settings[name] == network.settings[name] for name in ENCODER)
+    anew = "memory.glance.correction." if same else ("depth_encoder.", "memory.glance.")
     kept = {
         name: value for name, value in known.items() if not name.startswith(anew) and value.shape == state[name].shape
     }

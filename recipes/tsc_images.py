@@ -71,7 +71,7 @@ def check(cfg: Config) -> None:
 def collect(cfg: Config) -> TensorDictBase:
     """Walk and look: :func:`glances.asked`, ``[T, N]``."""
     student = load_trained(cfg.student, "student").network.settings
-    sizes = ("memory", "encoder_channels", "encoder_hidden", "encoder_features")
+    sizes = ("memory", "encoder_channels", "encoder_hidden", "encoder_features", "glance_hidden")
     own = {name: getattr(cfg, name) for name in ("course", "num_robots", "num_threads", "start_spread")}
     run, trained = resolve(
         replace(
@@ -81,7 +81,7 @@ def collect(cfg: Config) -> TensorDictBase:
             init_from=cfg.student,
             seed=cfg.seed,
             env=replace(CPU.env, **own),
-            **{name: student[name] for name in sizes},
+            **{name: student[name] for name in sizes if name in student},
         )
     )
     parts = build(run, trained)

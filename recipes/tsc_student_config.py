@@ -169,6 +169,8 @@ class Config(HardwareConfig):
     encoder_features: int = 32
     """Numbers that it makes of an image (supplement S6). They have to tell terrain latent, obstacle, place and
     progress."""
+    glance_hidden: tuple[int, ...] = (128,)
+    """Units of the layers that read from those, and an expected place, where the obstacle is (ours)."""
     heading_gate: float = HEADING_GATE
     """Heading errors beyond this are given, not predicted, in training [rad]: 0.6 (method notes, section 5.9)."""
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -193,6 +195,7 @@ CPU = Config(
     memory=256,
     encoder_channels=(16, 32, 64, 96),
     encoder_features=128,
+    glance_hidden=(256, 256, 256),
     heading_gate=4.0,
     env=EnvConfig(num_robots=64, randomize=False, push_interval=None, command_noise=(0.97, 1.03), start_spread=2.0),
     imitation=ImitationConfig(
@@ -220,6 +223,7 @@ SMOKE = replace(
     encoder_channels=(4, 8),
     encoder_hidden=8,
     encoder_features=8,
+    glance_hidden=(8, 8),
     env=replace(CPU.env, num_robots=4),
     imitation=replace(CPU.imitation, steps=4, epochs=1, minibatches=2),
     representation=replace(CPU.representation, images=8, hidden=16),

@@ -132,6 +132,7 @@ def build(cfg: Config, trained: Trained) -> Components:
         encoder_channels=cfg.encoder_channels,
         encoder_hidden=cfg.encoder_hidden,
         encoder_features=cfg.encoder_features,
+        glance_hidden=cfg.glance_hidden,
         heading_gate=cfg.heading_gate,
         period=env.dt * env.decision_steps,
         way_points=[[list(point) for point in kind.way_points] for kind in OBSTACLES.values()],
@@ -244,8 +245,8 @@ def load_student(parts: Components, path: Path, kept: tuple[str, ...]) -> None:
         has, builds = ({name: sizes.get(name) for name in differ} for sizes in (own, wanted))
         raise ArtifactError(
             f"{trained.artifact.folder}: the student has {has}, this run builds {builds}; give the same --memory, "
-            "--encoder-channels, --encoder-hidden, --encoder-features, --heading-gate and --env.course, and a teacher "
-            "of the same sizes"
+            "--encoder-channels, --encoder-hidden, --encoder-features, --glance-hidden, --heading-gate and "
+            "--env.course, and a teacher of the same sizes"
         )
     weights, fastest = trained.network.state_dict(), fastest_canter(parts.teacher_artifact)
     if trained.fastest_canter != fastest:  # it canters as fast as it did

@@ -32,6 +32,8 @@ class Glance(nn.Module):
         features: of an image.
         known: numbers of terrain latent, obstacle and progress.
         legs: obstacles of the course.
+        hidden: units of the layers between the feature with an expected place and the correction; where an obstacle
+            stands from there is a turn and a shift, which several layers say much better than one (docs/student.md).
 
     Example:
         >>> glance = Glance(32, (32, 7, 24), legs=6)
@@ -41,11 +43,11 @@ class Glance(nn.Module):
         (torch.Size([5, 63]), torch.Size([5, 4]), torch.Size([5, 3]))
     """
 
-    def __init__(self, features: int, known: Sequence[int], legs: int) -> None:
+    def __init__(self, features: int, known: Sequence[int], legs: int, hidden: Sequence[int] = (128,)) -> None:
         super().__init__()
         self.known, self.legs = tuple(known), legs
         self.linear = mlp(features, (), sum(known))
-        self.correction = mlp(features + NUM_POSE + legs, (128,), NUM_POSE + NUM_SCALES)
+        self.correction = mlp(features + NUM_POSE + legs, hidden, NUM_POSE + NUM_SCALES)
         for parameter in self.correction[-1].parameters():  # who has learned nothing corrects nothing
             nn.init.zeros_(parameter)
 

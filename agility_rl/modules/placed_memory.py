@@ -80,6 +80,7 @@ class PlacedMemory(nn.Module):
         way_points: ``[K, W, 2]``, of every type of obstacle, in its frame [m].
         routes: of every route of the course, where its obstacles stand in the arena: x, y [m], yaw [rad]
             (:attr:`agility_rl.envs.Course.legs`).
+        glance_hidden: units of the glance's hidden layers.
 
     Attributes:
         size: of the memory: units of the GRU, the pose half a decision later, the variances of x, y and yaw, and the
@@ -114,6 +115,7 @@ class PlacedMemory(nn.Module):
         period: float,
         way_points: Tensor,
         routes: Sequence[Sequence[Sequence[float]]] = (((0.0, 0.0, 0.0),),),
+        glance_hidden: Sequence[int] = (128,),
     ) -> None:
         super().__init__()
         legs, points = sum(map(len, routes)), way_points.shape[1]
@@ -129,7 +131,7 @@ class PlacedMemory(nn.Module):
         self.cell = nn.GRUCell(32, hidden_size)
         self.known = (NUM_TERRAIN_LATENT, num_obstacles, count)
         self.head = mlp(hidden_size, (), sum(self.known) + NUM_SCALES + 1)
-        self.glance = Glance(features, self.known, legs)
+        self.glance = Glance(features, self.known, legs, glance_hidden)
 
         stay, frames = torch.eye(count), torch.tensor([leg for route in routes for leg in route])
         entry = way_points[:, 0].mean(0, keepdim=True)

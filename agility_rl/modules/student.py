@@ -72,6 +72,7 @@ class RecurrentStudent(nn.Module):
         encoder_channels: of the depth encoder's convolutions.
         encoder_hidden: units of its hidden linear layer.
         encoder_features: numbers that it makes of an image.
+        glance_hidden: units of the hidden layers that read a place from those; who infers the place has them.
         heading_gate: see :data:`HEADING_GATE`.
         period: of a decision [s]; who infers the place counts what it has gone meanwhile.
         way_points: ``[K][W][2]``, of every type of obstacle in its frame [m]; who infers the place knows them.
@@ -104,6 +105,7 @@ class RecurrentStudent(nn.Module):
         encoder_channels: Sequence[int] = (32, 64),
         encoder_hidden: int = 128,
         encoder_features: int = NUM_FEATURES,
+        glance_hidden: Sequence[int] = (128,),
         heading_gate: float = HEADING_GATE,
         period: float = constants.CONTROL_DT,
         way_points: Sequence[Sequence[Sequence[float]]] = (),
@@ -127,12 +129,14 @@ class RecurrentStudent(nn.Module):
             "encoder_features": encoder_features,
             "heading_gate": heading_gate,
             **({"period": period, "way_points": way_points, "routes": routes} if num_place else {}),
+            **({"glance_hidden": list(glance_hidden)} if num_place else {}),
         }
         self.depth_encoder = DepthEncoder(encoder_features, channels=encoder_channels, hidden=encoder_hidden)
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
         sizes = (encoder_features, features.NUM_PROPRIOCEPTION, memory, num_obstacles)
-        self.memory = PlacedMemory(*sizes, period, torch.tensor(way_points), routes) if num_place else Memory(*sizes)
+        course = (torch.tensor(way_points), routes)
+        self.memory = PlacedMemory(*sizes, period, *course, glance_hidden) if num_place else Memory(*sizes)
         self.measured = [keys.PROPRIOCEPTION, *([keys.ESTIMATE] if num_place else [])]
         self.heading_gate = heading_gate
         inputs: dict[NestedKey, int] = {

@@ -33,6 +33,13 @@ def test_it_learns_where_an_obstacle_is_and_how_sure_that_is() -> None:
     assert scale.exp().mean(0)[0] < 0.08 and 0.2 < scale.exp().mean(0)[1] < 0.3
 
 
+def test_the_layers_that_read_a_place_are_those_asked_for() -> None:
+    glance = Glance(8, (4,), legs=2, hidden=(6, 5))
+    sizes = [layer.weight.shape for layer in glance.correction if isinstance(layer, torch.nn.Linear)]
+    assert sizes == [(6, 8 + 4 + 2), (5, 6), (4 + 3, 5)]
+    assert [tuple(layer.weight.shape) for layer in glance.linear if hasattr(layer, "weight")] == [(4, 8)]
+
+
 def test_scales_stay_within_bounds() -> None:
     glance = Glance(1, (1,), legs=1)
     for bias, expected in ((100.0, SCALES[1]), (-100.0, SCALES[0])):

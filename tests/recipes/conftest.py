@@ -53,7 +53,7 @@ def make_student(untrained_teacher: Path, tmp_path: Path, module: Callable[[str]
         teacher = Artifact.load(untrained_teacher / "policy")
         points = [[list(point) for point in kind.way_points] for kind in OBSTACLES.values()]
         sizes = {"memory": 16, "encoder_channels": (4, 8), "encoder_hidden": 8, "encoder_features": 8}
-        sizes |= {"heading_gate": 4.0}
+        sizes |= {"heading_gate": 4.0, "glance_hidden": (8, 8)}
         network = RecurrentStudent(
             **teacher.manifest["network"], **sizes, way_points=points, routes=COURSES["bar_jump"].legs
         )

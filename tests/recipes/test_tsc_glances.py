@@ -107,6 +107,18 @@ def test_an_encoder_of_other_sizes_keeps_the_rest(module: Module, images: Path, 
     assert (module("tsc_student").train(goes_on) / "policy" / "manifest.json").is_file()
 
 
+def test_other_layers_that_read_places_keep_the_encoder(module: Module, images: Path) -> None:
+    recipe = module("tsc_glances")
+    run = recipe.main(recipe.Config(**options_of(images.parent, glance_hidden=(6, 5), learning_rate=1e-9)))
+    artifact = Artifact.load(run / "policy", kind="student")
+    before = Artifact.load(images.parent / "student" / "policy").state
+    assert artifact.manifest["network"]["glance_hidden"] == [6, 5]
+    kept = {name for name, value in artifact.state.items() if name in before and value.shape == before[name].shape}
+    assert kept == {name for name in before if not name.startswith("memory.glance.correction.")}
+    for name in kept:
+        torch.testing.assert_close(artifact.state[name], before[name], atol=1e-6, rtol=0)
+
+
 def test_options_that_cannot_be(module: Module, images: Path) -> None:
     recipe, collect = module("tsc_glances"), module("tsc_images")
     for others, message in (
