@@ -49,8 +49,8 @@ class PlacedMemory(nn.Module):
 
     .. math:: \bar p_t &= T_{t - 1/2}^{t}\, p^+_{t - 1}, \qquad \bar P_t = P_{t - 1} + Q, \qquad
               p^+_t = T_{t}^{t + 1/2}\, p_t \\
-              b_t &\propto \left(b_{t - 1} + (N - 1)\, \lambda_t \odot b_{t - 1}\right) D
-              \odot \exp(\kappa_t\, e_t)
+              \bar b_t &= \left(b_{t - 1} + (N - 1)\, \lambda_t \odot b_{t - 1}\right) D, \qquad
+              b_t(w \mid l) \propto \bar b_t(w \mid l)\, \exp(\kappa_t\, e_t), \qquad b_t(l) = \bar b_t(l)
 
     p is the robot's pose in the arena, P the variance of its numbers. T moves it by half a decision's motion, as
     gyroscope, attitude and estimated velocity give it (:func:`~agility_rl.modules.planar.planar_motion`,
@@ -61,8 +61,9 @@ class PlacedMemory(nn.Module):
 
     The course is known but for its jitter and the order of its obstacles. b is the belief of a hidden Markov model in
     the way-point that is the present one, of all obstacles of all routes: N goes on to the next one, :math:`\lambda`
-    says of each whether it is :func:`reached`, D leaves some doubt for its neighbours, and the evidence e counts by a
-    share :math:`\kappa`, since images in a row are much alike. The likeliest way-point says which obstacle the pose is
+    says of each whether it is :func:`reached`, D leaves some doubt for its neighbours, and the evidence e, which
+    says how far at an obstacle l the robot is (:func:`told_within`), counts by a share :math:`\kappa`, since images in
+    a row are much alike. The likeliest way-point says which obstacle the pose is
     seen from and corrected by, as if that stood where it should. The place then is where the way-points of that type of
     obstacle lie from there (:func:`~agility_rl.modules.planar.seen_from`). Who has seen nothing stands before the first
     obstacle.
@@ -203,7 +204,7 @@ class PlacedMemory(nn.Module):
         done = reached(points[..., None, :, :] - at[..., None, :2]).flatten(-2)
         belief = (belief * (-done).sigmoid()).index_add(-1, self.following, belief * done.sigmoid())
         belief = (belief @ self.doubt).clamp(min=1e-30)
-        progress = (belief.log() + (weight + CREDIT).sigmoid() * evidence).log_softmax(-1)
+        progress = told_within(belief, (weight + CREDIT).sigmoid() * evidence, self.points)
         now = progress.argmax(-1)
         leg = now // self.points
         variance = torch.where((leg != before)[..., None], variance + self.jitter, variance)
@@ -240,6 +241,33 @@ class PlacedMemory(nn.Module):
 def of_leg(poses: Tensor, leg: Tensor) -> Tensor:
     """Of poses ``[*B, L, 4]`` that of a leg each, int64 ``[*B]``: ``[*B, 4]``."""
     return poses.take_along_dim(leg[..., None, None], -2)[..., 0, :]
+
+
+def told_within(belief: Tensor, evidence: Tensor, points: int) -> Tensor:
+    r"""Belief in way-points after evidence, which only says how far at an obstacle the robot is, not at which one.
+
+    .. math:: \log b(l, w) = \log \bar b(l) + \log \operatorname{softmax}_w\left(\log \bar b(l, w) + e(l, w)\right)
+
+    At which obstacle he is, who counts his way knows better than an image does: it shows much that is the same at
+    several of them, and in another arena what lies behind the obstacle ahead speaks for a wrong one (docs/student.md).
+
+    Source: ours.
+
+    Args:
+        belief: ``[*B, L W]``, in W way-points of each of L obstacles; positive.
+        evidence: ``[*B, L W]``.
+        points: W.
+
+    Returns:
+        ``[*B, L W]``, log-probabilities.
+
+    Example:
+        >>> told_within(torch.tensor([0.3, 0.3, 0.2, 0.2]), torch.tensor([0.0, 0.0, 9.0, 9.0]), 2).exp()
+        tensor([0.3000, 0.3000, 0.2000, 0.2000])
+    """
+    before = belief.log().unflatten(-1, (-1, points))
+    within = (before + evidence.unflatten(-1, (-1, points))).log_softmax(-1)
+    return (before.logsumexp(-1, keepdim=True) + within).flatten(-2).log_softmax(-1)
 
 
 def corrected(expected: Tensor, variance: Tensor, said: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:

@@ -173,6 +173,25 @@ def test_evidence_moves_the_belief_to_a_neighbour() -> None:
 
 
 @torch.no_grad()
+def test_evidence_does_not_say_at_which_obstacle() -> None:
+    """At the last way-point of the first obstacle, evidence for the next one's is a matter of that one alone."""
+    memory, bias = silent((FIRST, STRAIGHT))
+    bias["weight"].fill_(100.0)
+    at_which = []
+    for said in (0.0, 20.0):
+        bias["progress"][4:] = torch.tensor([0.0, 0.0, 0.0, said])
+        *inputs, state = still(memory, [-9.0, 0.0, 0.0, 1.0], 3)
+        for _ in range(5):
+            *_, state, _, progress = memory.step(*inputs, state)
+        torch.testing.assert_close(progress.exp().sum(), torch.tensor(1.0))
+        at_which.append(progress.exp()[0].unflatten(0, (2, 4)).sum(-1))
+    torch.testing.assert_close(at_which[0], at_which[1], rtol=0.2, atol=2e-3)
+    assert at_which[0][0] > 0.98
+    within = progress.exp()[0, 4:] / progress.exp()[0, 4:].sum()
+    assert within[3] > 0.9  # which of its way-points it would be, it does say
+
+
+@torch.no_grad()
 def test_an_episode_begins_before_the_first_obstacle_unless_told_otherwise() -> None:
     memory, _ = silent((FIRST, STRAIGHT, BACK))
     hidden, first = torch.randn(2, memory.size), torch.tensor([[True], [False]])
