@@ -28,6 +28,8 @@ ALIKE = 2.7
 """Logarithm of how many images in a row count as one at the start: their errors are alike."""
 CREDIT = -4.0
 """Added to the logit of the evidence's share: at the start a second of images, much alike, counts as half of one."""
+LEAVING = 0.6
+"""So far before its last way-point an obstacle may have been left [m]."""
 DOUBT = 1e-3
 """Share of the belief in a way-point that goes to each neighbour, so that what is seen later can speak for that."""
 CERTAIN = 8.0
@@ -50,7 +52,7 @@ class PlacedMemory(nn.Module):
     .. math:: \bar p_t &= T_{t - 1/2}^{t}\, p^+_{t - 1}, \qquad \bar P_t = P_{t - 1} + Q, \qquad
               p^+_t = T_{t}^{t + 1/2}\, p_t \\
               \bar b_t &= \left(b_{t - 1} + (N - 1)\, \lambda_t \odot b_{t - 1}\right) D, \qquad
-              b_t(w \mid l) \propto \bar b_t(w \mid l)\, \exp(\kappa_t\, e_t), \qquad b_t(l) = \bar b_t(l)
+              b_t \propto \bar b_t \odot \exp(\kappa_t\, e_t)
 
     p is the robot's pose in the arena, P the variance of its numbers. T moves it by half a decision's motion, as
     gyroscope, attitude and estimated velocity give it (:func:`~agility_rl.modules.planar.planar_motion`,
@@ -61,9 +63,9 @@ class PlacedMemory(nn.Module):
 
     The course is known but for its jitter and the order of its obstacles. b is the belief of a hidden Markov model in
     the way-point that is the present one, of all obstacles of all routes: N goes on to the next one, :math:`\lambda`
-    says of each whether it is :func:`reached`, D leaves some doubt for its neighbours, and the evidence e, which
-    says how far at an obstacle l the robot is (:func:`told_within`), counts by a share :math:`\kappa`, since images in
-    a row are much alike. The likeliest way-point says which obstacle the pose is
+    says of each whether it is :func:`reached`, D leaves some doubt for its neighbours, and the evidence e counts by a
+    share :math:`\kappa`, since images in a row are much alike, and for no obstacle where the robot cannot be
+    (:func:`told_of`). The likeliest way-point says which obstacle the pose is
     seen from and corrected by, as if that stood where it should. The place then is where the way-points of that type of
     obstacle lie from there (:func:`~agility_rl.modules.planar.seen_from`). Who has seen nothing stands before the first
     obstacle.
@@ -204,7 +206,8 @@ class PlacedMemory(nn.Module):
         done = reached(points[..., None, :, :] - at[..., None, :2]).flatten(-2)
         belief = (belief * (-done).sigmoid()).index_add(-1, self.following, belief * done.sigmoid())
         belief = (belief @ self.doubt).clamp(min=1e-30)
-        progress = told_within(belief, (weight + CREDIT).sigmoid() * evidence, self.points)
+        told = told_of(belief, (weight + CREDIT).sigmoid() * evidence, self._possible(belief, at, points))
+        progress = told.flatten(-2)
         now = progress.argmax(-1)
         leg = now // self.points
         variance = torch.where((leg != before)[..., None], variance + self.jitter, variance)
@@ -232,6 +235,20 @@ class PlacedMemory(nn.Module):
         second = torch.where(following == now, first, first + 1)
         return candidates.take_along_dim(torch.stack((first, second), -1)[..., None], -2).flatten(-2)
 
+    def _possible(self, belief: Tensor, at: Tensor, points: Tensor) -> Tensor:
+        """At which obstacles robots may be that have counted their way so far, bool ``[*B, L]``.
+
+        At the likeliest; at the next one if that is about to be left; at the one before as long as no way-point of
+        the likeliest is reached.
+        """
+        now = belief.argmax(-1)
+        leg = (now // self.points)[..., None]
+        nexts = self.following[self.points - 1 :: self.points] // self.points  # of every leg
+        legs = torch.arange(len(nexts), device=belief.device)
+        left = of_leg(at, leg[..., 0])[..., :1] > points[..., -1, :1] - LEAVING
+        first = (now % self.points == 0)[..., None]
+        return (legs == leg) | ((legs == nexts[leg]) & left) | ((nexts == leg) & first)
+
     def _marginals(self, belief: Tensor) -> tuple[Tensor, Tensor]:
         """Of legs ``[*B, L]``, and of how many way-points of an obstacle are reached ``[*B, W]``."""
         belief = belief.unflatten(-1, (-1, self.points))
@@ -243,31 +260,44 @@ def of_leg(poses: Tensor, leg: Tensor) -> Tensor:
     return poses.take_along_dim(leg[..., None, None], -2)[..., 0, :]
 
 
-def told_within(belief: Tensor, evidence: Tensor, points: int) -> Tensor:
-    r"""Belief in way-points after evidence, which only says how far at an obstacle the robot is, not at which one.
+def told_of(belief: Tensor, evidence: Tensor, possible: Tensor) -> Tensor:
+    r"""Belief in way-points after evidence, which speaks for another obstacle only where the robot can be at that one.
 
-    .. math:: \log b(l, w) = \log \bar b(l) + \log \operatorname{softmax}_w\left(\log \bar b(l, w) + e(l, w)\right)
+    .. math:: b(l, w) \propto \bar b(l)\, g(l)\, \bar b_e(w \mid l), \qquad
+              g_e(l) = \sum_w \bar b(w \mid l)\, e^{e(l, w)}, \qquad
+              g(l) = \begin{cases} g_e(l) & l \text{ possible} \\ \min(g_e(l), g_e(\hat l)) \end{cases}
 
-    At which obstacle he is, who counts his way knows better than an image does: it shows much that is the same at
-    several of them, and in another arena what lies behind the obstacle ahead speaks for a wrong one (docs/student.md).
+    :math:`\hat l` is the likeliest obstacle, :math:`\bar b_e(w \mid l)` the belief in the way-points of one after the
+    evidence. An image shows much that is the same at several obstacles; and in another arena than that of the training
+    it may speak for a wrong one with every frame, by what lies behind the obstacle ahead (docs/student.md).
 
     Source: ours.
 
     Args:
         belief: ``[*B, L W]``, in W way-points of each of L obstacles; positive.
-        evidence: ``[*B, L W]``.
-        points: W.
+        evidence: ``[*B, L W]``, logarithms.
+        possible: bool ``[*B, L]``.
 
     Returns:
-        ``[*B, L W]``, log-probabilities.
+        ``[*B, L, W]``, log-probabilities.
 
     Example:
-        >>> told_within(torch.tensor([0.3, 0.3, 0.2, 0.2]), torch.tensor([0.0, 0.0, 9.0, 9.0]), 2).exp()
-        tensor([0.3000, 0.3000, 0.2000, 0.2000])
+        >>> belief, evidence = torch.tensor([0.4, 0.4, 0.1, 0.1]), torch.tensor([0.0, 0.0, 2.0, 2.0])
+        >>> told_of(belief, evidence, torch.tensor([True, False])).exp()
+        tensor([[0.4000, 0.4000],
+                [0.1000, 0.1000]])
+        >>> told_of(belief, evidence, torch.tensor([True, True])).exp().sum(-1)
+        tensor([0.3512, 0.6488])
     """
-    before = belief.log().unflatten(-1, (-1, points))
-    within = (before + evidence.unflatten(-1, (-1, points))).log_softmax(-1)
-    return (before.logsumexp(-1, keepdim=True) + within).flatten(-2).log_softmax(-1)
+    shape = (*possible.shape, belief.shape[-1] // possible.shape[-1])
+    before = belief.log().view(shape)
+    after = before + evidence.reshape(shape)
+    leg = before.logsumexp(-1)
+    gain = after.logsumexp(-1) - leg
+    gain_now = gain.take_along_dim(leg.argmax(-1, keepdim=True), -1)
+    gain = torch.where(possible, gain, torch.minimum(gain, gain_now))
+    told = (leg + gain)[..., None] + after.log_softmax(-1)
+    return told - told.flatten(-2).logsumexp(-1)[..., None, None]
 
 
 def corrected(expected: Tensor, variance: Tensor, said: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
