@@ -140,7 +140,7 @@ class Config(HardwareConfig):
     """Folder under ``runs``."""
     runs: Path = Path("runs")
     seed: int = 0
-    teacher: Path = Path("pretrained/teacher_leaping")
+    teacher: Path = Path("pretrained/teacher_wary")
     """Run or artifact folder of the teacher; the student decides as often, on the same behaviours."""
     bbc: Path | None = None
     """Run or artifact folder of the Basic Behaviour Controller that the teacher was trained on; found by default."""

@@ -34,8 +34,8 @@ def full_course(wall_height: tuple[float, float] = (0.72, 0.72)) -> Course:
 def full_course_for_cameras() -> Course:
     """The challenge between walls that no camera can go by: of any height, each up to two metres farther out.
 
-    Where all images are taken in one arena, an encoder learns where its walls are, which say where an obstacle should
-    stand and not where it does.
+    In one arena its walls say where an obstacle should stand, not where it does; what learns from images here cannot
+    learn that.
 
     Source: heights: method notes, section 5.7; distances: ours.
     """
