@@ -167,8 +167,13 @@ class CourseLayout:
         """Restore what :meth:`state_dict` returned.
 
         Raises:
-            ValueError: if it is of another course or number of robots.
+            ValueError: if it is of another course or number of robots, or was saved when courses held less.
         """
+        if missing := [name for name in _BUFFERS if name not in state]:
+            raise ValueError(
+                f"the saved layout holds no {', '.join(missing)}: it is older than these; begin a new run, "
+                "with --init-from to keep what was learned"
+            )
         if state["yaw"].shape != self.yaw.shape:
             raise ValueError(
                 f"the saved layout holds {list(state['yaw'].shape)} robots x obstacles, expected "

@@ -153,6 +153,13 @@ def test_walls_may_stand_farther_out_in_every_episode_anew() -> None:
     assert torch.equal((layout.wall_distance != distance).any(-1), mask)
 
 
+def test_a_layout_that_was_saved_when_courses_held_less_is_refused() -> None:
+    layout = drawn(COURSES["full"], 3)
+    older = {name: value for name, value in layout.state_dict().items() if name != "wall_distance"}
+    with pytest.raises(ValueError, match="the saved layout holds no wall_distance: it is older"):
+        layout.load_state_dict(older)
+
+
 def test_two_obstacles_of_a_type_are_two() -> None:
     layout = drawn(COURSES["hurdles"], 3)
     assert len({piece.name for piece in layout.pieces}) == len(layout.pieces) == 8
