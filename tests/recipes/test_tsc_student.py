@@ -148,6 +148,7 @@ def test_glances_of_the_same_images_lower_their_errors(recipe: ModuleType, modul
     setup = module("tsc_student_setup")
     nothing = replace(smoke.augmentation, rectangle=0.0, white_noise=0.0, dropout=0.0, blur=0.0)
     cfg = replace(smoke, augmentation=nothing, precision="float32", glance=replace(smoke.glance, steps=1))
+    cfg = replace(cfg, glance_hidden=(128,))
     parts = setup.build(*setup.resolve(cfg))
     window, glances = parts.collector.collect(), module("glances")
     parts.glances.images.extend(glances.asked(window, glances.known_terrain(parts.teacher, window)).flatten())
