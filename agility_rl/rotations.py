@@ -120,6 +120,13 @@ def difference(start: Tensor, end: Tensor) -> Tensor:
     return delta[..., 1:] * torch.where(norm > 1e-8, angle / norm.clamp(min=1e-8), torch.full_like(norm, 2.0))
 
 
+def turn(vector: Tensor, yaw: Tensor) -> Tensor:
+    """Turn vectors of the plane ``[*B, 2]`` by angles ``[*B]`` [rad], to the left."""
+    cosine, sine = torch.cos(yaw), torch.sin(yaw)
+    x, y = vector[..., 0], vector[..., 1]
+    return torch.stack((cosine * x - sine * y, sine * x + cosine * y), -1)
+
+
 def wrap_angle(angle: Tensor) -> Tensor:
     """Wrap angles [rad] to (-pi, pi]."""
     return torch.atan2(torch.sin(angle), torch.cos(angle))

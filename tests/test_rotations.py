@@ -130,3 +130,9 @@ def test_wrap_angle() -> None:
     angles = torch.tensor([0.0, 3.0, -3.0, 2 * math.pi + 0.5, -7.0, 9.5], dtype=torch.float64)
     expected = torch.tensor([0.0, 3.0, -3.0, 0.5, 2 * math.pi - 7.0, 9.5 - 4 * math.pi], dtype=torch.float64)
     torch.testing.assert_close(rotations.wrap_angle(angles), expected, atol=1e-12, rtol=0)
+
+
+def test_turn_is_a_product_of_complex_numbers() -> None:
+    vector, yaw = torch.randn(6, 2, dtype=torch.float64), torch.linspace(-4.0, 4.0, 6, dtype=torch.float64)
+    product = torch.view_as_complex(vector) * torch.polar(torch.ones_like(yaw), yaw)
+    torch.testing.assert_close(rotations.turn(vector, yaw), torch.view_as_real(product))

@@ -129,7 +129,7 @@ class Arena:
         shift = torch.stack((-START_BEHIND * behind, spread * START_ASIDE * (2.0 * aside - 1.0)), -1)
         obstacle, local = self._stand(leg)
         place = self.layout.world(obstacle, local + shift)
-        yaw = self.layout.yaw.gather(1, obstacle[:, None])[:, 0] + spread * START_TURN * (2.0 * turn - 1.0)
+        yaw = self.layout.axis(obstacle) + spread * START_TURN * (2.0 * turn - 1.0)
         height = self.ground(place, simulator)[:, None] + constants.STANDING_HEIGHT + CLEARANCE
         level, still = torch.zeros_like(yaw), torch.zeros(n, 3, device=device)
         simulator.reset(
@@ -155,7 +155,7 @@ class Arena:
         if self.misjudgement is None:
             return position, yaw
         obstacle = self.progress.obstacle
-        axis = self.layout.yaw.gather(1, obstacle[:, None])[:, 0]
+        axis = self.layout.axis(obstacle)
         local, turned = self.misjudgement.misjudged(self.layout.local_to(obstacle, position), yaw - axis)
         return self.layout.world(obstacle, local), axis + turned
 
@@ -190,7 +190,7 @@ class Arena:
         ahead = (offset * forward).sum(-1)
         left = offset[..., 1] * forward[..., 0] - offset[..., 0] * forward[..., 1]
         obstacle = self.progress.obstacle
-        turned = yaw - self.layout.yaw.gather(1, obstacle[:, None])[:, 0]
+        turned = yaw - self.layout.axis(obstacle)
         local = self.layout.local_to(obstacle, position)
         way_points = torch.stack((ahead, left), -1).flatten(1)
         return torch.cat((way_points, local, turned.sin()[:, None], turned.cos()[:, None]), -1)

@@ -143,6 +143,10 @@ class CourseLayout:
         x, y = (points[:, None] - self.position[:, :, None]).unbind(-1)
         return torch.stack((cos * x + sin * y, cos * y - sin * x), -1)
 
+    def axis(self, obstacle: Tensor) -> Tensor:
+        """Yaw [rad] of one obstacle each (int64 ``[N]``), ``[N]``."""
+        return self.yaw.gather(1, obstacle[:, None])[:, 0]
+
     def local_to(self, obstacle: Tensor, point: Tensor) -> Tensor:
         """World points ``[N, 2]`` in the frame of one obstacle each (int64 ``[N]``), ``[N, 2]``."""
         row = torch.arange(len(obstacle), device=obstacle.device)

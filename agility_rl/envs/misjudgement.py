@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from agility_rl import rotations
+
 NEARBY = (0.05, 0.05, 0.03)
 """Deviations of an obstacle that is close: ahead, aside [m], yaw [rad]; near one, an image says where the robot stands
 to 0.04 m (median; docs/student.md)."""
@@ -70,8 +72,8 @@ class Misjudgement:
         ahead, aside, yaw = ((self._nearby + self._a_metre * distance) * self.error).unbind(-1)
         believed = turned + yaw
         # The obstacle is seen at -R(turned)^T local, and thought to be there and a bit beside.
-        seen = torch.stack((ahead, aside), -1) - _turned(local, -turned)
-        return -_turned(seen, believed), believed
+        seen = torch.stack((ahead, aside), -1) - rotations.turn(local, -turned)
+        return -rotations.turn(seen, believed), believed
 
     def state_dict(self) -> dict[str, Any]:
         """The errors."""
@@ -80,8 +82,3 @@ class Misjudgement:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
         self.error = state["error"].clone()
-
-
-def _turned(vector: Tensor, angle: Tensor) -> Tensor:
-    (x, y), cosine, sine = vector.unbind(-1), angle.cos(), angle.sin()
-    return torch.stack((cosine * x - sine * y, sine * x + cosine * y), -1)

@@ -297,7 +297,7 @@ def _feet(
         """Where the feet stand in stride ``number`` ``[T, 4]``: neutral under the trunk at mid-stance."""
         middle = schedule.touchdown + number * period + stance / 2 - offset
         planar, yaw = _path(middle, velocity, yaw_rate)
-        return planar + _turn(neutral, yaw)
+        return planar + rotations.turn(neutral, yaw)
 
     here, there = foothold(stride), foothold(stride + 1)
     # Cubic blend: no velocity at lift-off and touchdown; half of it linear in a leap, or the legs would be too short.
@@ -315,11 +315,4 @@ def _path(time: Tensor, velocity: Tensor, yaw_rate: float) -> tuple[Tensor, Tens
     yaw = yaw_rate * time
     # The integral of the turned velocity is the chord: straight distance x sinc, along the mean heading.
     chord = torch.sinc(yaw / (2 * torch.pi)) * time
-    return _turn(velocity, yaw / 2) * chord[..., None], yaw
-
-
-def _turn(vector: Tensor, yaw: Tensor) -> Tensor:
-    """Turn planar vectors ``[*B, 2]`` by yaw ``[*B]``."""
-    cosine, sine = torch.cos(yaw), torch.sin(yaw)
-    x, y = vector[..., 0], vector[..., 1]
-    return torch.stack((cosine * x - sine * y, sine * x + cosine * y), -1)
+    return rotations.turn(velocity, yaw / 2) * chord[..., None], yaw
