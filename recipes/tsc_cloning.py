@@ -46,7 +46,7 @@ def clone(parts: Components, cfg: CloningConfig, fastest_canter: float = FASTEST
     policy = led(parts, script, round(cfg.scripted * parts.env.num_robots))
     losses: dict[str, Tensor] = {}
     for _ in range(cfg.iterations):
-        batch = parts.rollout.collect(policy).select(*actor.in_keys, *READ).flatten()
+        batch = parts.learner.rollout.collect(policy).select(*actor.in_keys, *READ).flatten()
         label = targets(script.decide(batch.select(*READ))[keys.ACTION], before(batch.clone()), cfg.smoothing, allowed)
         for _ in range(cfg.epochs):
             for rows in permutation(len(batch), parts.generator).chunk(cfg.minibatches):

@@ -14,13 +14,11 @@ from hardware import simulator_options, training_device
 from held_fixed import INFERRED, privileged_loss
 from rollouts import Controller, load_controller
 from tensordict import TensorDictBase
-from torch import Tensor
 from torch.optim.swa_utils import AveragedModel
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives import KLAdaptiveLR
-from torchrl.objectives.value import GAE
 from tsc_config import Config, RewardConfig, RobotsConfig
 from tsc_curriculum import Curriculum
+from tsc_ppo import Learner, make_learner
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS, skill_index
@@ -31,19 +29,9 @@ from agility_rl.envs.agility_rewards import AGILITY_REWARDS, AgilityTerm, goal_v
 from agility_rl.envs.arena import NUM_PLACE
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import constants, features
-from agility_rl.losses import AdaptationLoss, HybridPPOLoss, ImitationReward
-from agility_rl.modules import Critic, Discriminator, FeatureNormalizer, Teacher
-from agility_rl.training.exploration import LastingNoise
-from agility_rl.training.ppo import FirstGroup, PPOUpdate
-from agility_rl.training.precision import hidden_precision
-from agility_rl.training.rollout import Rollout
+from agility_rl.losses import AdaptationLoss, ImitationReward
+from agility_rl.modules import Discriminator, FeatureNormalizer, Teacher
 from agility_rl.training.seeding import Seeds, seed_everything
-
-OBSERVED = (
-    *(keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.HISTORY),
-    *(keys.HEADING_ERROR, keys.PLACE, keys.OBSTACLE, keys.SCANDOTS),
-)
-"""What the critic reads (method notes, section 5.4: all of it; where the robot stands: ours)."""
 
 
 @dataclass
@@ -54,17 +42,12 @@ class Components:
     env: AgilityEnv
     teacher: Teacher
     averaged: AveragedModel | None
-    critic: Critic
     imitation: ImitationReward | None
     curriculum: Curriculum
-    rollout: Rollout
-    noise: LastingNoise | None
-    advantage: GAE
+    learner: Learner
     adaptation_loss: AdaptationLoss
     privileged_loss: AdaptationLoss
-    policy_optimizer: torch.optim.Optimizer
     adaptation_optimizer: torch.optim.Optimizer
-    ppo: PPOUpdate
     bbc: Controller
 
     @property
@@ -75,15 +58,14 @@ class Components:
     @property
     def alike(self) -> dict[str, Any]:
         """What every process holds alike; what is frozen comes from its own artifact."""
-        names = ["teacher", "critic", "curriculum", "policy_optimizer", "adaptation_optimizer"]
+        names = ["teacher", "curriculum", "adaptation_optimizer"]
         names += ["averaged"] if self.averaged is not None else []
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in names} | self.learner.alike
 
     @property
     def own(self) -> dict[str, Any]:
         """What each process has for itself."""
-        names = ("seeds", "env", "rollout") if self.noise is None else ("seeds", "env", "rollout", "noise")
-        return {name: getattr(self, name) for name in names}
+        return {"seeds": self.seeds, "env": self.env} | self.learner.own
 
 
 def build(cfg: Config) -> Components:
@@ -113,75 +95,28 @@ def build(cfg: Config) -> Components:
     num_place = NUM_PLACE if cfg.place else 0
     teacher = Teacher(len(OBSTACLES), ppo.hidden, ppo.initial_std, ppo.min_std, allowed, num_place).to(device)
     teacher.estimator.load_state_dict(controller.bbc.estimator.state_dict())  # method notes, section 5.3
-    width = sum(env.observation_spec[key].shape[1:].numel() for key in OBSERVED)
-    critic = Critic(width, in_keys=list(OBSERVED), hidden=ppo.hidden).to(device)
-    trained = teacher.trained_actor()
     acting = (teacher.privileged_encoder, teacher.scandots_encoder, teacher.actor)
-    groups: list[dict[str, Any]] = [{"params": [weight for part in acting for weight in part.parameters()]}]
-    if ppo.critic_learning_rate is None:
-        groups[0]["params"] += critic.parameters()
-    else:
-        groups.append({"params": list(critic.parameters()), "lr": ppo.critic_learning_rate})
-    policy_optimizer = torch.optim.Adam(groups, lr=ppo.learning_rate, fused=True)
-    loss = HybridPPOLoss(
-        trained,
-        critic,
-        continuous=ppo.continuous,
-        clip_epsilon=ppo.clip,
-        critic_coeff=ppo.value,
-        discrete_entropy_coeff=ppo.entropy,
-        continuous_entropy_coeff=ppo.entropy,
-        bounds_coeff=ppo.bounds,
-    )
-
-    def divergence(sample: TensorDictBase) -> Tensor:
-        teacher.actor.project_std()
-        return loss.divergence(sample)["continuous"]  # of this part alone: method notes, section 5.2
-
-    schedule = None
-    if ppo.desired_kl is not None:
-        schedule = KLAdaptiveLR(FirstGroup(policy_optimizer), ppo.desired_kl, max_lr=ppo.max_learning_rate)
-    noise = None
-    if ppo.noise_seconds is not None:
-        decision_dt = env.dt * cfg.env.decision_steps
-        noise = LastingNoise(
-            ppo.noise_seconds, decision_dt, seeds.generator("exploration"), (keys.ACTION, keys.PARAMETERS)
-        )
-    outcome = [keys.OUTCOME, keys.TERMINATIONS, keys.REWARD_TERMS, keys.MOTION, keys.SKILL, keys.OBSTACLE]
     return Components(
         seeds=seeds,
         env=env,
         teacher=teacher,
         averaged=moving_average(teacher, ppo.averaging),
-        critic=critic,
         imitation=imitation,
         curriculum=Curriculum.start(cfg.curriculum, env),
-        rollout=Rollout(
+        learner=make_learner(
+            ppo,
             env,
-            ppo.steps,
-            keep=[*OBSERVED, keys.ESTIMATE, keys.ACTION, "logits", "loc", "scale"],
-            keep_next=["reward", *outcome],
-            value=lambda observation: critic(observation.select(*OBSERVED))["state_value"],
+            teacher.trained_actor(),
+            teacher.actor,
+            acting,
+            seeds,
+            keep=[keys.ESTIMATE],
+            keep_in_minibatches=[INFERRED],
         ),
-        noise=noise,
-        advantage=GAE(gamma=ppo.gamma, lmbda=ppo.lmbda, value_network=None, time_dim=0),
         adaptation_loss=AdaptationLoss(teacher.history_encoder, teacher.privileged_encoder),
         privileged_loss=privileged_loss(teacher.privileged_encoder),
-        policy_optimizer=policy_optimizer,
         adaptation_optimizer=torch.optim.Adam(
             teacher.history_encoder.parameters(), lr=cfg.adaptation.learning_rate, fused=True
-        ),
-        ppo=PPOUpdate(
-            loss,
-            policy_optimizer,
-            epochs=ppo.epochs,
-            minibatches=ppo.minibatches,
-            max_grad_norm=ppo.max_grad_norm,
-            keep=["logits", "loc", "scale", INFERRED],
-            divergence=divergence,
-            schedule=schedule,
-            precision=hidden_precision(ppo.precision, device),
-            compile=ppo.compile,
         ),
         bbc=controller,
     )

@@ -26,10 +26,10 @@ from torch import Tensor
 from training_run import Laps, own_options, run
 from tsc_cloning import clone
 from tsc_config import PRESETS, Config
+from tsc_ppo import add_rewards, limit_deviations, value_finished, what_happened
 from tsc_script import read
 from tsc_setup import Components, build, save_policy
 
-from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.deploy.task import fastest_canter
@@ -50,61 +50,36 @@ HEADLINE += tuple(f"success/{name}" for name in OBSTACLES)
 HEADLINE += tuple(f"use/{name}" for name in BEHAVIOURS)
 
 
-@torch.no_grad()
-def add_rewards(parts: Components, cfg: Config, batch: TensorDictBase) -> dict[str, Tensor]:
-    """``r = 2.0 r^T + 0.2 r^I dt`` (Table S4); returns the means of both."""
-    after, task = batch["next"], cfg.reward.task * batch["next", "reward"]
-    after["reward"] = task
-    metrics = {"reward/task": task.mean()}
-    if parts.imitation is not None:
-        metrics["reward/imitation"] = (parts.imitation(after)["reward"] - task).mean()
-    return metrics
-
-
-def value_finished(batch: TensorDictBase, value: float | None) -> None:
-    """Bootstrap finished courses by ``value`` in place of what the critic makes of states that it never sees.
-
-    Source: ours (docs/agility.md, "What helped, by experiment").
-
-    Args:
-        batch: ``(next, state_value)`` [T, N, 1], changed in place, and bool ``(next, outcome, finished)`` [T, N, 1].
-        value: discounted reward after the finish; ``None`` leaves the critic's, as released.
-    """
-    if value is not None:
-        batch["next", "state_value"].masked_fill_(batch["next", keys.OUTCOME, "finished"], value)
-
-
 def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     """One iteration of Algorithm S3's first loop; returns metrics by name."""
     lap = Laps()
     set_course(parts.env, parts.curriculum)
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     policy = parts.teacher.deployable_policy() if with_history else parts.teacher.privileged_policy()
-    batch = parts.rollout.collect(policy if parts.noise is None else parts.noise.around(policy))
+    batch = parts.learner.collect(policy)
     lap("collect")
     metrics: dict[str, Any] = judge(parts.env, parts.curriculum, batch)
-    metrics |= add_rewards(parts, cfg, batch)
+    metrics |= add_rewards(parts.imitation, cfg.reward.task, batch)
     value_finished(batch, cfg.reward.finished)
     weight = functional.linear_ramp(iteration, *cfg.adaptation.privileged_ramp, cfg.adaptation.privileged)
     parts.privileged_loss.privileged = weight  # the loss applies its own coefficient
     if not with_history:
         with torch.no_grad():
-            parts.advantage(batch)
+            parts.learner.advantage(batch)
         if weight > 0.0:
             infer(parts.teacher.history_encoder, batch)
 
         def extra(sample: TensorDictBase) -> Tensor:
             return parts.privileged_loss(sample)["loss_privileged"] if weight > 0.0 else torch.zeros(())
 
-        metrics |= parts.ppo(batch, parts.generator, extra, critic_only=iteration < cfg.ppo.critic_warm_up)
+        metrics |= parts.learner.update(batch, parts.generator, extra, critic_only=iteration < cfg.ppo.critic_warm_up)
     lap("policy")
     optimizer, minibatches = parts.adaptation_optimizer, cfg.adaptation.minibatches
     metrics |= fit((parts.adaptation_loss,), optimizer, batch, minibatches, parts.generator)
     lap("adaptation")
     if parts.averaged is not None:
         parts.averaged.update_parameters(parts.teacher)
-    metrics |= {f"task/{name}": value.mean() for name, value in batch["next", keys.REWARD_TERMS].items()}
-    metrics["std"] = parts.teacher.actor.network.parameters_head.std.detach().mean()
+    metrics |= what_happened(batch, parts.teacher.actor)
     return {name: float(value) for name, value in metrics.items()} | lap.metrics
 
 
@@ -118,9 +93,7 @@ def begin(parts: Components, cfg: Config) -> None:
         if (had := fastest_canter(start)) != cfg.env.fastest_canter:  # it canters as fast as it did
             start = replace(start, state=rescale_canter(start.state, had, cfg.env.fastest_canter))
         start.fill(parts.teacher)
-        head = parts.teacher.actor.network.parameters_head
-        head.min_std.fill_(cfg.ppo.min_std)
-        head.std.data.clamp_(cfg.ppo.min_std, cfg.ppo.initial_std)
+        limit_deviations(parts.teacher.actor, cfg.ppo)
     if copies(cfg):
         set_course(parts.env, parts.curriculum)
         clone(parts, cfg.cloning, cfg.env.fastest_canter)

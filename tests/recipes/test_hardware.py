@@ -16,11 +16,13 @@ from agility_rl.simulation import HardwareError
 from tests.devices import NamesDevices
 
 Module = Callable[[str], ModuleType]
-RECIPES = ("bbc_pretrain", "tsc_teacher", "tsc_student")
+RECIPES = ("bbc_pretrain", "tsc_teacher", "tsc_student", "tsc_practice")
 
 
 @pytest.fixture
-def options(module: Module, untrained: Path, untrained_teacher: Path, tmp_path: Path) -> Callable[[str], Any]:
+def options(
+    module: Module, untrained: Path, untrained_teacher: Path, make_student: Callable[..., Path], tmp_path: Path
+) -> Callable[[str], Any]:
     """A tiny run of each recipe."""
 
     def make(name: str) -> Any:
@@ -28,6 +30,8 @@ def options(module: Module, untrained: Path, untrained_teacher: Path, tmp_path: 
         cfg = replace(cfg, runs=tmp_path, env=replace(cfg.env, num_threads=1))
         if name == "tsc_teacher":
             return replace(cfg, bbc=untrained, reward=replace(cfg.reward, imitation=0.0))
+        if name == "tsc_practice":
+            return replace(cfg, student=make_student(fastest_canter=2.0), bbc=untrained)
         return replace(cfg, teacher=untrained_teacher, bbc=untrained) if name == "tsc_student" else cfg
 
     return make
@@ -59,7 +63,8 @@ def test_an_iteration_names_the_device_of_all_it_makes(
     else:
         parts = recipe.build(cfg)
     with NamesDevices() as mode:
-        recipe.begin(parts, cfg)
+        if name != "tsc_practice":  # which begins with the student as it is
+            recipe.begin(parts, cfg)
         for iteration in range(2):
             recipe.iterate(parts, cfg, iteration)
     parts.env.close()

@@ -168,7 +168,7 @@ def test_options_of_the_course_reach_it(recipe: ModuleType, smoke: Any) -> None:
     assert (parts.env.arena.start_spread, parts.env.arena.start_after) == (2.0, 0.5)
     errors = parts.env.arena.misjudgement
     assert errors is not None and errors.kept == math.exp(-0.02 * env.decision_steps)
-    assert parts.ppo.loss.bounds_coeff == 0.25 and "loss_bounds" in parts.ppo.loss.out_keys
+    assert parts.learner.update.loss.bounds_coeff == 0.25 and "loss_bounds" in parts.learner.update.loss.out_keys
     assert parts.env.termination_reward == -500.0 and parts.env.rewards["heading"].weight == 0.25
     parts.env.close()
 

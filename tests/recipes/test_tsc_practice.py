@@ -1,0 +1,100 @@
+"""A student's practice on a few robots, called in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from agility_rl import keys
+from agility_rl.deploy.artifact import Artifact
+from agility_rl.modules.student import NEXT_HIDDEN, PERCEIVED_PLACE
+from agility_rl.record.mcap_logger import read_scalars
+
+Module = Callable[[str], ModuleType]
+
+
+@pytest.fixture
+def recipe(module: Module) -> ModuleType:
+    return module("tsc_practice")
+
+
+@pytest.fixture
+def smoke(recipe: ModuleType, untrained: Path, make_student: Callable[..., Path], tmp_path: Path) -> Any:
+    cfg = recipe.PRESETS["smoke"]
+    student, env = make_student(fastest_canter=2.5, data=[]), replace(cfg.env, num_threads=1)
+    return replace(cfg, runs=tmp_path, student=student, bbc=untrained, env=env, precision="float32")
+
+
+def test_a_run_changes_the_actor_and_nothing_else(recipe: ModuleType, smoke: Any) -> None:
+    run = recipe.train(replace(smoke, iterations=3))
+    before, after = (Artifact.load(path / "policy", kind="student") for path in (smoke.student, run))
+    moved = {name.split(".")[0] for name in before.state if not torch.equal(before.state[name], after.state[name])}
+    assert moved == {"actor"}
+    for name in recipe.INHERITED:
+        assert after.manifest[name] == before.manifest[name], name
+    assert after.manifest["practised_from"] == before.manifest["weights"]["sha256"]
+    assert after.manifest["course"] == "bar_jump" and after.manifest["control_period"] == pytest.approx(0.04)
+    scalars = read_scalars(run)
+    for name in ("reward/task", "kl", "loss_critic", "success/bar_jump", "use/trot", "task/heading", "std"):
+        assert bool(scalars[name][1].isfinite().all()), name
+    assert "success/tunnel" not in scalars
+    assert read_scalars(run)["kl_continuous"][1][0].abs() < 1e-3, "the first iteration leaves the policy as it is"
+
+
+def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smoke: Any) -> None:
+    whole = recipe.train(replace(smoke, name="whole", iterations=4))
+    halves = recipe.train(replace(smoke, name="halves", iterations=2))
+    recipe.train(replace(smoke, resume=halves, iterations=4))
+    one, other = (Artifact.load(run / "policy").state for run in (whole, halves))
+    assert not [name for name in one if not torch.equal(one[name], other[name])]
+    for name in ("reward/task", "loss_critic", "use/jump"):
+        assert torch.equal(read_scalars(whole)[name][1], read_scalars(halves)[name][1]), name
+
+
+def test_it_perceives_as_when_it_walks_by_itself(recipe: ModuleType, smoke: Any) -> None:
+    """What a roll-out stores is what a plain loop sees, whose memory begins anew where an episode ends."""
+    short = replace(smoke.env, episode_length=0.2)  # five decisions
+    cfg = replace(smoke, env=short, ppo=replace(smoke.ppo, steps=12, noise_seconds=None))
+    parts, plain = recipe.build(cfg), recipe.build(cfg)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        batch = parts.learner.collect(parts.policy).clone()
+    student, env, n = plain.student, plain.env, plain.env.num_robots
+    policy, td = student.policy(assisted=True), env.reset()
+    hidden, first, ends = student.initial_hidden(n), torch.ones(n, 1, dtype=torch.bool), 0
+    for step in range(12):
+        td.update({keys.HIDDEN: hidden, "is_init": first})
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            td = policy(td)
+        for key in (PERCEIVED_PLACE, keys.TERRAIN_LATENT, "loc", (keys.ACTION, keys.BEHAVIOUR)):
+            assert torch.equal(batch[key][step], td[key]), (key, step)
+        hidden = td[NEXT_HIDDEN]
+        full, td = env.step_and_maybe_reset(td)
+        first = full["next", "done"]
+        ends += int(first.sum())
+    assert ends >= 2 * n
+    for one in (parts, plain):
+        one.env.close()
+
+
+def test_it_refuses_what_it_cannot_practise(
+    command: Callable[..., Any], smoke: Any, untrained_teacher: Path, tmp_path: Path
+) -> None:
+    def refused(*options: object) -> str:
+        result = command("tsc_practice", "smoke", "--runs", tmp_path / "runs", "--bbc", smoke.bbc, *options)
+        assert result.returncode != 0 and "Traceback" not in result.stderr
+        return " ".join((result.stderr + result.stdout).split())
+
+    assert "expected a student of tsc_student.py, got an artifact of kind 'teacher'" in refused(
+        "--student", untrained_teacher
+    )
+    assert "whose obstacles stand elsewhere; it can practise on bar_jump" in refused(
+        "--student", smoke.student, "--env.course", "full"
+    )
+    assert not list((tmp_path / "runs").glob("*"))
