@@ -54,6 +54,11 @@ class Config:
     """Share of the robots that do what the teacher says: they see what lies behind where the student fails."""
     start_spread: float = 4.0
     """How many times as far aside and turned as released episodes start; 4 is how robots leave an obstacle."""
+    start_after: float = 0.0
+    """Share of the episodes that start where the obstacle before is left. A student that walks knows nothing of that;
+    with ``--led 1 --episode-length 4`` all images are of the way from one obstacle to the next."""
+    episode_length: float = 40.0
+    """Seconds."""
     num_robots: int = 64
     num_threads: int = 1
     """Of this process."""
@@ -72,7 +77,7 @@ def collect(cfg: Config) -> TensorDictBase:
     """Walk and look: :func:`glances.asked`, ``[T, N]``."""
     student = load_trained(cfg.student, "student").network.settings
     sizes = ("memory", "encoder_channels", "encoder_hidden", "encoder_features", "glance_hidden")
-    own = {name: getattr(cfg, name) for name in ("course", "num_robots", "num_threads", "start_spread")}
+    robots = ("course", "num_robots", "num_threads", "start_spread", "start_after", "episode_length")
     run, trained = resolve(
         replace(
             CPU,
@@ -80,7 +85,7 @@ def collect(cfg: Config) -> TensorDictBase:
             bbc=cfg.bbc,
             init_from=cfg.student,
             seed=cfg.seed,
-            env=replace(CPU.env, **own),
+            env=replace(CPU.env, **{name: getattr(cfg, name) for name in robots}),
             **{name: student[name] for name in sizes if name in student},
         )
     )

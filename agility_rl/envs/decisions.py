@@ -70,7 +70,7 @@ class Decisions:
         """Take a decision of every robot, int64 ``[N]`` and ``[N, 5, 6]``."""
         chosen = parameters.take_along_dim(behaviour[:, None, None], 1)[:, 0].clamp(-1.0, 1.0)
         command, shift = behaviours.commands_from_parameters(behaviour, chosen, self.bounds)
-        if self.noise[0] != self.noise[1]:
+        if tuple(self.noise) != (1.0, 1.0):
             command = command * uniform(command.shape, self.noise, self.generator)
         self.commands.assign(torch.ones_like(self.fresh), behaviour, command, shift)
         news = {"behaviours": behaviour, "parameters": parameters, "applied": chosen}

@@ -35,6 +35,9 @@ def test_noise_multiplies_each_command_but_not_the_shift(generator: torch.Genera
     torch.testing.assert_close(factor.mean(0), torch.ones(4), atol=0.02, rtol=0)
     assert torch.corrcoef(factor.T).triu(1).abs().max() < 0.1
     assert (decisions.commands.shift == 1.0).all()
+    decisions = Decisions(5, generator, noise=(0.8, 0.8))  # a slower robot, for all that it is told
+    decisions.decide(torch.full((5,), 2), numbers(5, 1.0))
+    torch.testing.assert_close(decisions.commands.command[:, 0], (0.8 * exact[0]).expand(5))
     with pytest.raises(ValueError, match="command noise"):
         Decisions(1, generator, noise=(1.2, 0.8))
 

@@ -62,6 +62,17 @@ def test_images_between_other_walls(module: Module, images: Path, student: Any, 
     assert walls < sky - 0.05  # walls where the sky was
 
 
+def test_images_of_short_episodes_show_where_they_start(
+    module: Module, images: Path, student: Any, tmp_path: Path
+) -> None:
+    recipe = module("tsc_images")
+    options = {"student": tmp_path / "student", "teacher": student.teacher, "bbc": student.bbc, "runs": tmp_path}
+    short = recipe.main(recipe.Config(**options, episode_length=0.4, led=1.0, name="short", windows=1, num_robots=4))
+    along = load_file(short / "images.safetensors")["place"][..., 4]  # [m] from the bar, whose way begins 1.8 m before
+    assert ((along[::10] > -2.01) & (along[::10] < -1.79)).all()  # ten decisions each
+    assert not torch.equal(along[0], along[10])
+
+
 def options_of(folder: Path, **others: Any) -> dict[str, Any]:
     given = {"images": (folder / "images",), "student": folder / "student", "runs": folder, "batch": 8}
     return given | {"minutes": 0.002} | others
