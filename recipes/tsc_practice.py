@@ -223,7 +223,7 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
         control_period=parts.env.dt * parts.env.decision_steps,
         data=before["data"],
     )
-    manifest |= {name: before[name] for name in INHERITED}
+    manifest |= {name: before[name] for name in INHERITED if name in before}
     manifest["course"] = parts.env.arena.layout.course.name
     manifest["practised_from"] = before["weights"]["sha256"]
     Artifact.save(folder / "policy", saved(parts.student, parts.averaged).state_dict(), manifest)
@@ -231,9 +231,14 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
 
 def train(cfg: Config) -> Path:
     """Practise; returns the run folder."""
+    cfg = own_options(cfg)
+    if cfg.reward.imitation:
+        raise ValueError(
+            f"--reward.imitation: practice pays for the task alone; expected 0, not {cfg.reward.imitation}"
+        )
     return run(
         "tsc_practice",
-        own_options(cfg),
+        cfg,
         build,
         begin=lambda parts, cfg: None,
         iterate=iterate,

@@ -31,7 +31,7 @@ def options(
         if name == "tsc_teacher":
             return replace(cfg, bbc=untrained, reward=replace(cfg.reward, imitation=0.0))
         if name == "tsc_practice":
-            return replace(cfg, student=make_student(fastest_canter=2.0), bbc=untrained)
+            return replace(cfg, student=make_student(), bbc=untrained)
         return replace(cfg, teacher=untrained_teacher, bbc=untrained) if name == "tsc_student" else cfg
 
     return make

@@ -28,7 +28,7 @@ def recipe(module: Module) -> ModuleType:
 @pytest.fixture
 def smoke(recipe: ModuleType, untrained: Path, make_student: Callable[..., Path], tmp_path: Path) -> Any:
     cfg = recipe.PRESETS["smoke"]
-    student, env = make_student(fastest_canter=2.5, data=[]), replace(cfg.env, num_threads=1)
+    student, env = make_student(fastest_canter=2.5), replace(cfg.env, num_threads=1)
     return replace(cfg, runs=tmp_path, student=student, bbc=untrained, env=env, precision="float32")
 
 
@@ -96,5 +96,8 @@ def test_it_refuses_what_it_cannot_practise(
     )
     assert "whose obstacles stand elsewhere; it can practise on bar_jump" in refused(
         "--student", smoke.student, "--env.course", "full"
+    )
+    assert "--reward.imitation: practice pays for the task alone; expected 0, not 0.2" in refused(
+        "--student", smoke.student, "--reward.imitation", 0.2
     )
     assert not list((tmp_path / "runs").glob("*"))
