@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.objectives import KLAdaptiveLR
 from torchrl.objectives.value import GAE
@@ -63,7 +63,6 @@ def make_learner(
     env: AgilityEnv,
     trained: ProbabilisticTensorDictSequential,
     actor: HybridActor,
-    acting: Sequence[nn.Module],
     seeds: Seeds,
     *,
     stepped: EnvBase | None = None,
@@ -75,9 +74,8 @@ def make_learner(
     Args:
         ppo: options.
         env: the course.
-        trained: the policy as PPO's loss takes it.
+        trained: the policy as PPO's loss takes it; all of it learns.
         actor: its last part, whose deviations have a floor.
-        acting: modules that the policy's rate trains.
         seeds: sources of randomness.
         stepped: what roll-outs step, if that is more than ``env``.
         keep: entries that roll-outs keep beside those that every learner needs.
@@ -85,7 +83,7 @@ def make_learner(
     """
     width = sum(env.observation_spec[key].shape[1:].numel() for key in OBSERVED)
     critic = Critic(width, in_keys=list(OBSERVED), hidden=ppo.hidden).to(env.device)
-    groups: list[dict[str, Any]] = [{"params": [weight for part in acting for weight in part.parameters()]}]
+    groups: list[dict[str, Any]] = [{"params": list(trained.parameters())}]
     if ppo.critic_learning_rate is None:
         groups[0]["params"] += critic.parameters()
     else:
@@ -153,7 +151,8 @@ def limit_deviations(actor: HybridActor, ppo: PPOConfig) -> None:
 
 @torch.no_grad()
 def add_rewards(imitation: ImitationReward | None, weight: float, batch: TensorDictBase) -> dict[str, Tensor]:
-    """``r = 2.0 r^T + 0.2 r^I dt`` (Table S4), of which ``weight`` is the first number; returns the means of both."""
+    """``r = 2.0 r^T + 0.2 r^I dt`` (Table S4), of which ``weight`` is the first number, added
+    to a batch ``[T, N]``; returns the means of both."""
     after, task = batch["next"], weight * batch["next", "reward"]
     after["reward"] = task
     metrics = {"reward/task": task.mean()}
@@ -176,6 +175,6 @@ def value_finished(batch: TensorDictBase, value: float | None) -> None:
 
 
 def what_happened(batch: TensorDictBase, actor: HybridActor) -> dict[str, Tensor]:
-    """Means of the reward's terms and of the actor's deviations."""
+    """Means of the reward's terms over a batch ``[T, N]``, and of the actor's deviations."""
     means = {f"task/{name}": value.mean() for name, value in batch["next", keys.REWARD_TERMS].items()}
     return means | {"std": actor.network.parameters_head.std.detach().mean()}

@@ -147,7 +147,6 @@ def build(cfg: Config) -> Components:
     student = trained.network.to(device).requires_grad_(False)
     assert isinstance(student, RecurrentStudent)
     student.actor.requires_grad_(True)
-    limit_deviations(student.actor, cfg.ppo)
     student.depth_encoder.to(memory_format=torch.channels_last)
     student.depth_encoder.module.precision = hidden_precision(cfg.precision, device)
     controller = load_bbc_of(trained, cfg.bbc)
@@ -184,7 +183,6 @@ def build(cfg: Config) -> Components:
             env,
             student.actor,
             student.actor,
-            (student.actor,),
             seeds,
             stepped=TransformedEnv(env, Compose(InitTracker(), memory)),
             keep=student.actor.in_keys,
@@ -193,6 +191,11 @@ def build(cfg: Config) -> Components:
         artifact=trained.artifact,
         bbc=controller,
     )
+
+
+def begin(parts: Components, cfg: Config) -> None:
+    """A new run starts with the student as it is, but for how far it tries something else."""
+    limit_deviations(parts.student.actor, cfg.ppo)
 
 
 def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
@@ -240,7 +243,7 @@ def train(cfg: Config) -> Path:
         "tsc_practice",
         cfg,
         build,
-        begin=lambda parts, cfg: None,
+        begin=begin,
         iterate=iterate,
         save_policy=save_policy,
         headline=HEADLINE,

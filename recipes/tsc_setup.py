@@ -95,7 +95,6 @@ def build(cfg: Config) -> Components:
     num_place = NUM_PLACE if cfg.place else 0
     teacher = Teacher(len(OBSTACLES), ppo.hidden, ppo.initial_std, ppo.min_std, allowed, num_place).to(device)
     teacher.estimator.load_state_dict(controller.bbc.estimator.state_dict())  # method notes, section 5.3
-    acting = (teacher.privileged_encoder, teacher.scandots_encoder, teacher.actor)
     return Components(
         seeds=seeds,
         env=env,
@@ -108,7 +107,6 @@ def build(cfg: Config) -> Components:
             env,
             teacher.trained_actor(),
             teacher.actor,
-            acting,
             seeds,
             keep=[keys.ESTIMATE],
             keep_in_minibatches=[INFERRED],
