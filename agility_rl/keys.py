@@ -112,6 +112,10 @@ HEADING_ESTIMATE = "heading_estimate"
 PLACE_ESTIMATE = "place_estimate"
 """float32 ``[*B, 8]``, the student's guess of :data:`PLACE`, where its teacher reads that."""
 
+SCAN_MATCH = "scan_match"
+"""float32 ``[*B, 7]``, where the obstacle ahead is seen by its shape: x, y [m], sine and cosine of its yaw in the
+robot's frame, then the variances of x, y [m^2] and yaw [rad^2]."""
+
 PROGRESS_LOGITS = "progress_logits"
 """float32 ``[*B, S]``, the student's log-probabilities of :data:`PROGRESS`, where its teacher reads the place."""
 

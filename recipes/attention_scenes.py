@@ -115,9 +115,9 @@ def collect_scenes(
         contexts, decisions = [], []
         for index, (decider, student) in enumerate(zip(deciders, students, strict=True)):
             read = [key for key in student.policy().in_keys if key not in (keys.DEPTH, keys.HIDDEN, "is_init")]
-            context = td.select(*read).set(keys.HIDDEN, hidden[index]).set("is_init", is_init)
+            context = td.select(*read).set(keys.HIDDEN, hidden[index]).set("is_init", is_init).set(keys.DEPTH, images)
             with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-                written = decider.decide(context.clone().set(keys.DEPTH, images))
+                written = decider.decide(context.clone())
             hidden[index] = written[NEXT_HIDDEN]
             decisions.append(written[keys.ACTION].select(keys.BEHAVIOUR, keys.PARAMETERS))
             contexts.append(context)

@@ -137,6 +137,7 @@ def build(cfg: Config, trained: Trained) -> Components:
         period=env.dt * env.decision_steps,
         way_points=[[list(point) for point in kind.way_points] for kind in OBSTACLES.values()],
         routes=[[list(leg) for leg in route] for route in env.arena.layout.course.legs],
+        solids=[kind.solids() for kind in OBSTACLES.values()],
     ).to(device)
     for name in frozen_parts(cfg):
         getattr(student, name).requires_grad_(False)
@@ -168,7 +169,7 @@ def build(cfg: Config, trained: Trained) -> Components:
                 *([keys.SCANDOTS] if apart or imitation.latent is not None else []),
                 *([keys.PLACE, keys.PROGRESS] if apart else []),
             ),
-            keep_written=[keys.DEPTH_FEATURE] if apart else [],
+            keep_written=[keys.DEPTH_FEATURE, *([] if place is None else [keys.SCAN_MATCH])] if apart else [],
             keep_next=("reward", keys.OUTCOME, keys.TERMINATIONS),
         ),
         curriculum=Curriculum.start(cfg.curriculum, env),
@@ -237,8 +238,8 @@ def load_student(parts: Components, path: Path, kept: tuple[str, ...]) -> None:
     """
     trained = load_trained(path, "student")
     # A student is told what to do and draws nothing: what its teacher's deviations were makes no difference. How often
-    # it decides is this run's: it only counts its way by it.
-    ignored = ("initial_std", "min_std", "period")
+    # it decides is this run's: it only counts its way by it; and what obstacles are made of is no matter of weights.
+    ignored = ("initial_std", "min_std", "period", "solids")
     own, wanted = trained.network.settings, parts.student.settings
     differ = [name for name in wanted if name not in ignored and own.get(name) != wanted[name]]
     if differ:

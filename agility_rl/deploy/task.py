@@ -59,7 +59,8 @@ class StudentNetwork(nn.Module):
         self, depth: Tensor, proprioception: Tensor, history: Tensor, hidden: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Logits, parameters, heading errors [rad], obstacle logits, memory."""
-        known = {keys.PROPRIOCEPTION: proprioception, keys.ESTIMATE: self.estimator(proprioception)}
+        estimate = self.estimator(proprioception)
+        known = {keys.DEPTH: depth, keys.PROPRIOCEPTION: proprioception, keys.ESTIMATE: estimate}
         latent, heading, obstacle, after, *places = self.memory.step(
             self.encoder(depth), *(known[name] for name in self.measured), hidden
         )

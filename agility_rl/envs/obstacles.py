@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -83,6 +83,23 @@ class Obstacle:
     passage: float = math.inf
     edges: tuple[Zone, ...] = ()
     target_speed: float = WALK_SPEED
+
+    def solids(self) -> list[list[Any]]:
+        """What it is made of, as :class:`~agility_rl.modules.distance_field.DistanceField` reads it: kind, size,
+        position, quaternion, and the range of heights to which that may be lifted; a hinge as nobody stands on it.
+
+        Example:
+            >>> OBSTACLES["bar_jump"].solids()[-1]
+            ['capsule', [0.03, 0.6], [0.0, 0.0, 0.0], [0.7071, 0.7071, 0.0, 0.0], [0.05, 0.2]]
+        """
+        made: list[list[Any]] = []
+        for number, piece in enumerate(self.pieces):
+            lift = self.difficulty[:2] if self.difficulty is not None and number == self.lifted else (0.0, 0.0)
+            still = [(shape, shape.position, shape.quaternion) for shape in piece.shapes]
+            for shape, *pose in (*still, *(() if piece.hinge is None else piece.hinge.resting())):
+                rounded = ([round(value, 4) for value in values] for values in pose)
+                made.append([shape.kind, list(shape.size), *rounded, list(lift)])
+        return made
 
 
 def _turned(angle: float, axis: str) -> tuple[float, float, float, float]:

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from agility_rl.modules.distance_field import Solid
 from agility_rl.modules.glance import NUM_POSE, NUM_SCALES, Glance
 from agility_rl.modules.mlp import mlp
 from agility_rl.modules.planar import bearings, inverse, inverted, moved, planar_motion, seen_from, within
+from agility_rl.modules.scan_matching import NOTHING, NUM_MATCH, ScanMatcher
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 
 NUM_PLACE = 8
@@ -58,8 +60,10 @@ class PlacedMemory(nn.Module):
     gyroscope, attitude and estimated velocity give it (:func:`~agility_rl.modules.planar.planar_motion`,
     :func:`~agility_rl.modules.planar.moved`); Q is what that adds in uncertainty. A
     :class:`~agility_rl.modules.glance.Glance` says where the obstacle ahead is seen and how sure that is, by which the
-    pose is :func:`corrected`. A GRU, which sees the feature, proprioception, what is expected of the place, and b, says
-    how many images in a row count as one, and adds to what the glance says of terrain latent, obstacle and e.
+    pose is :func:`corrected`; then by where the shape of that type of obstacle fits what the image measures, as far as
+    it is in view (:class:`~agility_rl.modules.scan_matching.ScanMatcher`). A GRU, which sees the feature,
+    proprioception, what is expected of the place, and b, says how many images in a row count as one, and adds to what
+    the glance says of terrain latent, obstacle and e.
 
     The course is known but for its jitter and the order of its obstacles. b is the belief of a hidden Markov model in
     the way-point that is the present one, of all obstacles of all routes: N goes on to the next one, :math:`\lambda`
@@ -84,6 +88,7 @@ class PlacedMemory(nn.Module):
         routes: of every route of the course, where its obstacles stand in the arena: x, y [m], yaw [rad]
             (:attr:`agility_rl.envs.Course.legs`).
         glance_hidden: units of the glance's hidden layers.
+        solids: ``[K][...]``, what every type of obstacle is made of; without, nothing is matched.
 
     Attributes:
         size: of the memory: units of the GRU, the pose half a decision later, the variances of x, y and yaw, and the
@@ -92,9 +97,9 @@ class PlacedMemory(nn.Module):
     Example:
         >>> memory = PlacedMemory(32, 45, 16, 7, 0.04, torch.zeros(7, 4, 2), [[(2.0, 3.0, 1.57), (2.0, 7.0, 1.57)]])
         >>> outputs = memory(torch.zeros(5, 3, 32), torch.zeros(5, 3, 45), torch.zeros(5, 3, 4),
-        ...     torch.zeros(5, 3, memory.size), torch.zeros(5, 3, 1, dtype=torch.bool))
+        ...     torch.zeros(5, 3, 58, 87), torch.zeros(5, 3, memory.size), torch.zeros(5, 3, 1, dtype=torch.bool))
         >>> [tuple(output.shape) for output in outputs]
-        [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 31), (5, 3, 8), (5, 3, 8)]
+        [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 31), (5, 3, 8), (5, 3, 8), (5, 3, 7)]
     """
 
     way_points: Tensor
@@ -119,6 +124,7 @@ class PlacedMemory(nn.Module):
         way_points: Tensor,
         routes: Sequence[Sequence[Sequence[float]]] = (((0.0, 0.0, 0.0),),),
         glance_hidden: Sequence[int] = (128,),
+        solids: Sequence[Sequence[Solid]] = (),
     ) -> None:
         super().__init__()
         legs, points = sum(map(len, routes)), way_points.shape[1]
@@ -135,6 +141,7 @@ class PlacedMemory(nn.Module):
         self.known = (NUM_TERRAIN_LATENT, num_obstacles, count)
         self.head = mlp(hidden_size, (), sum(self.known) + NUM_SCALES + 1)
         self.glance = Glance(features, self.known, legs, glance_hidden)
+        self.matcher = ScanMatcher(solids) if solids else None
 
         stay, frames = torch.eye(count), torch.tensor([leg for route in routes for leg in route])
         entry = way_points[:, 0].mean(0, keepdim=True)
@@ -160,16 +167,19 @@ class PlacedMemory(nn.Module):
         feature: Tensor,
         proprioception: Tensor,
         estimate: Tensor,
+        look: Tensor,
         hidden: Tensor,
         is_init: Tensor,
         start: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """Steps of ``[T, *B]``: terrain latent, heading errors [rad], obstacle logits, memory after, place, progress.
+        """Steps of ``[T, *B]``: terrain latent, heading errors [rad], obstacle logits, memory after, place, progress,
+        match.
 
-        The last are log-probabilities. Of ``hidden`` only the first step's counts; it begins as :meth:`begun` does.
+        Progress are log-probabilities. A ``look`` is an image ``[58, 87]``, or the match that came of it when it was
+        seen. Of ``hidden`` only the first step's counts; it begins as :meth:`begun` does.
         """
         state, steps = hidden[0], []
-        for time, measured in enumerate(zip(feature, proprioception, estimate, strict=True)):
+        for time, measured in enumerate(zip(feature, proprioception, estimate, look, strict=True)):
             state = self.begun(state, is_init[time], None if start is None else start[time])
             steps.append(self.step(*measured, state))
             state = steps[-1][3]
@@ -188,7 +198,9 @@ class PlacedMemory(nn.Module):
             is_init, torch.cat((empty, pose, empty[..., :NUM_SCALES], CERTAIN * start - self.prior), -1), hidden
         )
 
-    def step(self, feature: Tensor, proprioception: Tensor, estimate: Tensor, hidden: Tensor) -> tuple[Tensor, ...]:
+    def step(
+        self, feature: Tensor, proprioception: Tensor, estimate: Tensor, look: Tensor, hidden: Tensor
+    ) -> tuple[Tensor, ...]:
         """One step of ``[*B]``, with outputs as :meth:`forward`."""
         remembered, pose, variance, belief = hidden.split(self.parts, -1)
         belief = (belief + self.prior).softmax(-1)
@@ -213,12 +225,24 @@ class PlacedMemory(nn.Module):
         variance = torch.where((leg != before)[..., None], variance + self.jitter, variance)
         ahead = inverted(of_leg(at, leg))
         said, scale = self.glance.where(feature, ahead, leg)
-        ahead, variance = corrected(ahead, variance, said, scale + 0.5 * (alike + ALIKE))
+        ahead, variance = corrected(ahead, variance, said, 2.0 * (2.0 * scale + alike + ALIKE).exp())
+        match = self._match(look, proprioception, estimate, ahead, logits.argmax(-1))
+        ahead, variance = corrected(ahead, variance, *match.split((NUM_POSE, NUM_SCALES), -1))
         obstacle = inverted(ahead)
         pose = of_leg(within(obstacle, self.arena), leg)
         place = torch.cat((self._goals(now, pose, obstacle, points), obstacle), -1)
         after = (remembered, moved(pose, motion) - self.starts[0], variance - self.uncertain, progress - self.prior)
-        return latent.tanh(), bearings(place), logits, torch.cat(after, -1), place, progress
+        return latent.tanh(), bearings(place), logits, torch.cat(after, -1), place, progress, match
+
+    def _match(self, look: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor, kind: Tensor) -> Tensor:
+        """What the shape of an obstacle says of where it stands, ``[*B, 7]``."""
+        if look.shape[-1] == NUM_MATCH:
+            return look
+        if self.matcher is None:
+            return torch.cat((expected, torch.full_like(expected[..., :NUM_SCALES], NOTHING)), -1).detach()
+        rows = (part.reshape(-1, part.shape[-1]) for part in (proprioception, estimate, expected))
+        match: Tensor = self.matcher(look.reshape(-1, *look.shape[-2:]), *rows, kind.reshape(-1))
+        return match.reshape(*expected.shape[:-1], NUM_MATCH)
 
     def _remember(self, inputs: Tensor, remembered: Tensor) -> Tensor:
         fused = self.fusion(inputs)
@@ -300,30 +324,31 @@ def told_of(belief: Tensor, evidence: Tensor, possible: Tensor) -> Tensor:
     return told - told.flatten(-2).logsumexp(-1)[..., None, None]
 
 
-def corrected(expected: Tensor, variance: Tensor, said: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+def corrected(expected: Tensor, variance: Tensor, said: Tensor, unsure: Tensor) -> tuple[Tensor, Tensor]:
     r"""Where an obstacle is seen and the variance of that, after something was said of it, with how sure that is.
 
-    .. math:: k = \frac{\bar P}{\bar P + 2 e^{2 s}}\, c(m, \bar o), \qquad o = \bar o + k\, (m - \bar o), \qquad
+    .. math:: k = \frac{\bar P}{\bar P + R}\, c(m, \bar o), \qquad o = \bar o + k\, (m - \bar o), \qquad
               P = (1 - k)\, \bar P
 
     Sine and cosine of the yaw share a variance. What is said of a place far from the one expected is of another
     obstacle: c is how :func:`credible` it is.
 
-    Source: Kalman 1960 (doi:10.1115/1.3662552); :math:`2 e^{2 s}` is the variance of Laplace's distribution.
+    Source: Kalman 1960 (doi:10.1115/1.3662552). A glance's R is :math:`2 e^{2 s}`, the variance of Laplace's
+    distribution.
 
     Args:
         expected: ``[*B, 4]``: x, y [m], sine and cosine of the yaw of the obstacle, seen by the robot.
         variance: ``[*B, 3]``, of x, y [m^2] and yaw [rad^2].
         said: ``[*B, 4]``, as the first.
-        scale: ``[*B, 3]``, logarithm of how far that is off on average.
+        unsure: ``[*B, 3]``, variance of that, R.
 
     Example:
         >>> here, there = torch.tensor([2.0, 0.0, 0.0, 1.0]), torch.tensor([2.1, 0.1, 0.0, 1.0])
-        >>> place, variance = corrected(here, torch.full((3,), 0.02), there, torch.tensor([0.1, 0.3, 1.0]).log())
+        >>> place, variance = corrected(here, torch.full((3,), 0.02), there, torch.tensor([0.02, 0.18, 2.0]))
         >>> place.round(decimals=2), variance.round(decimals=3)
         (tensor([2.0500, 0.0100, 0.0000, 1.0000]), tensor([0.0100, 0.0180, 0.0200]))
     """
-    gain = variance / (variance + 2.0 * (2.0 * scale).exp()) * credible(said, expected)
+    gain = variance / (variance + unsure) * credible(said, expected)
     position, yaw = torch.lerp(expected, said, torch.cat((gain, gain[..., 2:]), -1)).split(2, -1)
     return torch.cat((position, nn.functional.normalize(yaw, dim=-1)), -1), (1.0 - gain) * variance
 

@@ -92,6 +92,16 @@ def inverse(frames: Tensor) -> Tensor:
     return torch.stack((-cos * x - sin * y, sin * x - cos * y, -yaw), -1)
 
 
+def attitude(proprioception: Tensor) -> tuple[Tensor, Tensor]:
+    """Roll and pitch ``[*B, 2]`` [rad] and angular velocity in the base frame ``[*B, 3]`` [rad/s] of ``[*B, 45]``.
+
+    Example:
+        >>> [part.shape[-1] for part in attitude(torch.zeros(45))]
+        [2, 3]
+    """
+    return proprioception[..., _ROLL_PITCH], proprioception[..., _ANGULAR] / features.ANGULAR_VELOCITY_SCALE
+
+
 def planar_motion(proprioception: Tensor, estimate: Tensor) -> Tensor:
     r"""Velocity of a robot over the ground, in the frame of its heading.
 
@@ -112,8 +122,7 @@ def planar_motion(proprioception: Tensor, estimate: Tensor) -> Tensor:
         >>> planar_motion(proprioception, estimate)
         tensor([1., 0., 0.])
     """
-    roll, pitch = proprioception[..., _ROLL_PITCH].unbind(-1)
-    _, rate_y, rate_z = (proprioception[..., _ANGULAR] / features.ANGULAR_VELOCITY_SCALE).unbind(-1)
+    (roll, pitch), (_, rate_y, rate_z) = (part.unbind(-1) for part in attitude(proprioception))
     x, y, z = (estimate[..., _LINEAR] / features.LINEAR_VELOCITY_SCALE).unbind(-1)
     down = roll.sin() * y + roll.cos() * z
     yaw_rate = (rate_y * roll.sin() + rate_z * roll.cos()) / pitch.cos().clamp(min=0.2)  # nobody walks so steeply

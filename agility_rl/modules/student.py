@@ -16,6 +16,7 @@ from agility_rl.go2 import constants, features
 from agility_rl.modules.adaptation import HistoryEncoder
 from agility_rl.modules.behaviour_controller import NUM_LATENT
 from agility_rl.modules.depth_encoder import DepthEncoder
+from agility_rl.modules.distance_field import Solid
 from agility_rl.modules.estimator import StateEstimator
 from agility_rl.modules.hybrid_actor import HybridActor
 from agility_rl.modules.mlp import mlp
@@ -57,8 +58,8 @@ class RecurrentStudent(nn.Module):
     with ``num_place`` also ``progress`` [*B, S], of which the first of an episode counts.
     Keys written: ``depth_feature`` [*B, F], ``terrain_latent`` [*B, 32], ``heading_estimate`` [*B, 2],
     ``obstacle_logits`` [*B, 7], ``(memory, hidden)`` [*B, 512], ``(perceived, heading_error)``,
-    ``(perceived, obstacle)``, with ``num_place`` also ``place_estimate`` [*B, 8], ``progress_logits`` [*B, S] and
-    ``(perceived, place)``,
+    ``(perceived, obstacle)``, with ``num_place`` also ``place_estimate`` [*B, 8], ``progress_logits`` [*B, S],
+    ``scan_match`` [*B, 7] and ``(perceived, place)``,
     ``estimate``, ``latent`` and those of :class:`~agility_rl.modules.HybridActor`.
 
     Args:
@@ -78,9 +79,11 @@ class RecurrentStudent(nn.Module):
         way_points: ``[K][W][2]``, of every type of obstacle in its frame [m]; who infers the place knows them.
         routes: ``[R][L][3]``, where the obstacles of the course stand (:attr:`agility_rl.envs.Course.legs`); who infers
             the place knows that too, but for the jitter.
+        solids: ``[K][...]``, what every type of obstacle is made of; who infers the place and knows them matches them
+            with what images measure.
 
     Raises:
-        ValueError: if ``num_place`` is another number, or obstacles lack way-points.
+        ValueError: if ``num_place`` is another number, or obstacles lack way-points or solids.
 
     Example:
         >>> from tensordict import TensorDict
@@ -110,12 +113,15 @@ class RecurrentStudent(nn.Module):
         period: float = constants.CONTROL_DT,
         way_points: Sequence[Sequence[Sequence[float]]] = (),
         routes: Sequence[Sequence[Sequence[float]]] = (((0.0, 0.0, 0.0),),),
+        solids: Sequence[Sequence[Solid]] = (),
     ) -> None:
         super().__init__()
         if num_place not in (0, NUM_PLACE):
             raise ValueError(f"num_place must be 0 or {NUM_PLACE}, got {num_place}")
         if num_place and len(way_points) != num_obstacles:
             raise ValueError(f"expected way_points of {num_obstacles} types of obstacles, got {len(way_points)}")
+        if solids and len(solids) != num_obstacles:
+            raise ValueError(f"expected solids of {num_obstacles} types of obstacles, got {len(solids)}")
         self.settings: dict[str, Any] = {
             "num_obstacles": num_obstacles,
             "hidden": list(hidden),
@@ -129,15 +135,15 @@ class RecurrentStudent(nn.Module):
             "encoder_features": encoder_features,
             "heading_gate": heading_gate,
             **({"period": period, "way_points": way_points, "routes": routes} if num_place else {}),
-            **({"glance_hidden": list(glance_hidden)} if num_place else {}),
+            **({"glance_hidden": list(glance_hidden), "solids": solids} if num_place else {}),
         }
         self.depth_encoder = DepthEncoder(encoder_features, channels=encoder_channels, hidden=encoder_hidden)
         self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
         sizes = (encoder_features, features.NUM_PROPRIOCEPTION, memory, num_obstacles)
         course = (torch.tensor(way_points), routes)
-        self.memory = PlacedMemory(*sizes, period, *course, glance_hidden) if num_place else Memory(*sizes)
-        self.measured = [keys.PROPRIOCEPTION, *([keys.ESTIMATE] if num_place else [])]
+        self.memory = PlacedMemory(*sizes, period, *course, glance_hidden, solids) if num_place else Memory(*sizes)
+        self.measured = [keys.PROPRIOCEPTION, *([keys.ESTIMATE, keys.DEPTH] if num_place else [])]
         self.heading_gate = heading_gate
         inputs: dict[NestedKey, int] = {
             keys.PROPRIOCEPTION: features.NUM_PROPRIOCEPTION,
@@ -177,21 +183,22 @@ class RecurrentStudent(nn.Module):
                 way-point where an episode starts from ``progress``. Without, episodes start before the first obstacle.
             sequence: for batches ``[T, *B]`` of consecutive steps, time first, instead of one step ``[*B]``; of
                 ``hidden`` only the first step's counts.
-            seen: read the images' ``depth_feature`` instead of the images.
+            seen: read the images' ``depth_feature``, and ``scan_match``, instead of the images.
         """
         remember = self.memory if sequence else _OneStep(self.memory, 1 + len(self.measured))
         start = [keys.PROGRESS] if assisted and self.settings["num_place"] else []
         perceive = _Perception(self.heading_gate if assisted else None)
         placed = self.settings["num_place"] > 0
+        measured = [keys.SCAN_MATCH if seen and name == keys.DEPTH else name for name in self.measured]
         return TensorDictSequential(
             *([] if seen else [self.depth_encoder]),
             self.estimator,
             TensorDictModule(
                 remember,
-                in_keys=[keys.DEPTH_FEATURE, *self.measured, keys.HIDDEN, "is_init", *start],
+                in_keys=[keys.DEPTH_FEATURE, *measured, keys.HIDDEN, "is_init", *start],
                 out_keys=[
                     *(keys.TERRAIN_LATENT, keys.HEADING_ESTIMATE, keys.OBSTACLE_LOGITS, NEXT_HIDDEN),
-                    *([keys.PLACE_ESTIMATE, keys.PROGRESS_LOGITS] if placed else []),
+                    *([keys.PLACE_ESTIMATE, keys.PROGRESS_LOGITS, keys.SCAN_MATCH] if placed else []),
                 ],
             ),
             TensorDictModule(

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import mujoco
+import torch
+
+from agility_rl import rotations
 
 PARKED_DEPTH = -10.0
 """Height at which pieces wait that no one has placed yet [m]: below the ground, out of every robot's reach."""
@@ -63,6 +67,17 @@ class Hinge:
     axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
     limits: tuple[float, float] = (-0.1, 0.1)
     damping: float = 0.0
+
+    def resting(self) -> list[tuple[Shape, tuple[float, ...], tuple[float, ...]]]:
+        """What turns, with position and quaternion in the frame of the piece at the lowest angle."""
+        half = 0.5 * self.limits[0]
+        turn = torch.tensor([math.cos(half), *(math.sin(half) * along for along in self.axis)])
+        placed = []
+        for shape in self.shapes:
+            position = torch.tensor(self.position) + rotations.rotate(turn, torch.tensor(shape.position))
+            quaternion = rotations.multiply(turn, torch.tensor(shape.quaternion))
+            placed.append((shape, tuple(position.tolist()), tuple(quaternion.tolist())))
+        return placed
 
 
 @dataclass(frozen=True)

@@ -28,13 +28,15 @@ from agility_rl.modules import RecurrentStudent
 from agility_rl.modules.student import NEXT_HIDDEN
 
 POINTS = [[[x, 0.0] for x in (-1.5, -0.5, 0.5, 1.5)] for _ in range(7)]
+BALL = ["sphere", [0.4], [0.0, 0.0, 0.4], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0]]
 
 
-@pytest.fixture(params=[0, 8], ids=["headings only", "place"])
+@pytest.fixture(params=[(0, []), (8, []), (8, [[BALL]] * 7)], ids=["headings only", "place", "shapes"])
 def student(request: pytest.FixtureRequest) -> RecurrentStudent:
     """Random weights, biases included."""
+    num_place, solids = request.param
     network = RecurrentStudent(
-        hidden=(32, 16), num_place=request.param, memory=24, encoder_hidden=16, way_points=POINTS
+        hidden=(32, 16), num_place=num_place, memory=24, encoder_hidden=16, way_points=POINTS, solids=solids
     )
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():

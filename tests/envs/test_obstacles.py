@@ -13,6 +13,7 @@ from agility_rl.envs.course import Course, Slot
 from agility_rl.envs.layout import CourseLayout
 from agility_rl.envs.obstacles import OBSTACLES, SEESAW_TILT
 from agility_rl.go2 import constants
+from agility_rl.modules.distance_field import signed_distance
 from agility_rl.simulation import BatchSimulator
 
 DOWN = torch.tensor([0.0, 0.0, -1.0])
@@ -146,6 +147,29 @@ def test_seesaw_tips_under_a_robot_that_has_crossed_the_pivot() -> None:
     torch.testing.assert_close(
         profile(layout, simulator, x, 0.25 + 0 * x), heights(simulator, x, 0.25 + 0 * x), atol=3e-3, rtol=0
     )
+
+
+@pytest.mark.parametrize("name", OBSTACLES)
+def test_solids_are_what_rays_hit(name: str) -> None:
+    """Rays from all around end on the surface of a solid, wherever they do not end on the ground."""
+    simulator, layout = stand(name)
+    generator = torch.Generator().manual_seed(0)
+    away = torch.nn.functional.normalize(torch.randn(600, 3, generator=generator), dim=-1)
+    middle = torch.tensor([5.0, 5.0, 0.0])
+    origin = middle + 2.5 * torch.cat((away[:, :2], 0.1 + away[:, 2:].abs()), -1)
+    reach = torch.tensor([*layout.kinds[0].half_extents, 0.3])
+    aim = middle + reach * (2.0 * torch.rand(600, 3, generator=generator) - 1.0)
+    direction = torch.nn.functional.normalize(aim - origin, dim=-1)
+    distance = simulator.ray(origin[None], direction[None])[0]
+    points = (origin + distance[:, None] * direction - middle)[distance.isfinite() & (distance > 0.0)]
+    points = points[points[:, 2] > 0.01]
+    assert len(points) > 50
+    height = layout.lift[0, 0].item()
+    solids = OBSTACLES[name].solids()
+    drawn = [(*solid, (height, height) if low < high else (0.0, 0.0)) for *solid, (low, high) in solids]
+    off, swept = (torch.stack([signed_distance(solid, points) for solid in kind]).amin(0) for kind in (drawn, solids))
+    assert off.abs().max() < 1e-3
+    assert swept.max() < 6e-3  # at any height; six stand for all of them
 
 
 def test_edges_are_strips_of_five_centimetres_or_the_whole_gate() -> None:

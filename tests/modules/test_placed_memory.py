@@ -39,7 +39,8 @@ def still(memory: PlacedMemory, pose: list[float], at: int | None = None) -> tup
         belief = belief - 30.0
         belief[at] = 0.0
     before = torch.cat((torch.tensor(pose) - memory.starts[0], torch.zeros(3), belief - memory.prior))
-    return torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4), torch.cat((torch.zeros(8), before))[None]
+    seen = torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4), torch.zeros(1, 58, 87)
+    return *seen, torch.cat((torch.zeros(8), before))[None]
 
 
 @torch.no_grad()
@@ -53,7 +54,9 @@ def test_who_sees_nothing_only_counts_the_way() -> None:
     begun = torch.tensor([-9.0, 0.0, 0.0, 1.0])
     hidden = still(memory, begun.tolist())[-1]
     first = torch.zeros(steps, 1, 1, dtype=torch.bool)
-    *_, after, place, _ = memory(torch.zeros(steps, 1, 32), proprioception, estimate, hidden[None], first)
+    *_, after, place, _, _ = memory(
+        torch.zeros(steps, 1, 32), proprioception, estimate, torch.zeros(steps, 1, 58, 87), hidden[None], first
+    )
     expected = torch.tensor([-9.0, 10.0 / math.pi, 0.0, -1.0])
     torch.testing.assert_close(after[-1, 0, 8:12] + memory.starts[0], expected, atol=0.06, rtol=0.0)
     torch.testing.assert_close(place[0, 0, 4:], moved(begun, torch.tensor([0.025, 0.0, math.pi / 200.0])))
@@ -72,11 +75,24 @@ def test_a_place_is_corrected_by_as_much_as_it_is_unsure_and_credible() -> None:
     gain = variance / (variance + 2.0 * torch.tensor([0.1, 0.2, 0.05]) ** 2)
     for closer in (0.5, -4.0):
         bias["correction"].copy_(torch.tensor([-closer, 0.0, 0.0, 0.0]))
-        *_, after, place, _ = memory.step(*still(memory, [-1.0, 0.1, 0.0, 1.0], 1))
+        *_, after, place, _, _ = memory.step(*still(memory, [-1.0, 0.1, 0.0, 1.0], 1))
         share = gain / (1.0 + closer**4)
         expected = torch.tensor([-1.0 + share[0].item() * closer, 0.1, 0.0, 1.0])
         torch.testing.assert_close(place[0, 4:], expected)
         torch.testing.assert_close(after[0, 12:15] + torch.tensor(START), (1.0 - share) * variance)
+
+
+@torch.no_grad()
+def test_a_match_corrects_what_a_glance_has_left() -> None:
+    """An obstacle 1 m ahead is said to be 0.2 m nearer, by what is as sure as the memory: half of that counts."""
+    memory, _ = silent()
+    *seen, hidden = still(memory, [-1.0, 0.0, 0.0, 1.0], 1)
+    variance = torch.tensor(START) + 0.05 * torch.tensor(DRIFT)
+    seen[3] = torch.cat((torch.tensor([0.8, 0.0, 0.0, 1.0]), variance))[None]
+    *_, after, place, _, match = memory.step(*seen, hidden)
+    torch.testing.assert_close(place[0, 4:], torch.tensor([-0.9, 0.0, 0.0, 1.0]), atol=2e-4, rtol=0.0)
+    torch.testing.assert_close(after[0, 12:15] + torch.tensor(START), variance / 2.0, rtol=2e-3, atol=0.0)
+    assert torch.equal(match, seen[3])
 
 
 @torch.no_grad()
@@ -85,7 +101,7 @@ def test_who_turns_does_so_about_the_obstacle() -> None:
     memory, bias = silent()
     bias["alike"].fill_(-200.0)
     bias["correction"].copy_(torch.tensor([0.0, 0.0, math.sin(0.5), math.cos(0.5) - 1.0]))
-    *_, place, _ = memory.step(*still(memory, [-1.0, 0.0, 0.0, 1.0], 1))
+    *_, place, _, _ = memory.step(*still(memory, [-1.0, 0.0, 0.0, 1.0], 1))
     expected = torch.tensor([-math.cos(0.5), math.sin(0.5), -math.sin(0.5), math.cos(0.5)])
     torch.testing.assert_close(place[0, 4:], expected)
 
@@ -100,7 +116,7 @@ def test_many_images_are_as_good_as_their_mean_and_no_better_than_alike() -> Non
     inputs = still(memory, [-1.5, 0.0, 0.0, 1.0], 1)
     state = inputs[-1]
     for _ in range(100):
-        state = memory.step(*inputs[:3], state)[3]
+        state = memory.step(*inputs[:4], state)[3]
     expected = 1.0 / (1.0 / torch.tensor(START) + 10.0 / (2.0 * 0.3**2))
     torch.testing.assert_close(state[0, 12:15] + torch.tensor(START), expected, rtol=1e-3, atol=0.0)
 
@@ -109,7 +125,7 @@ def test_many_images_are_as_good_as_their_mean_and_no_better_than_alike() -> Non
 def test_the_next_obstacle_may_stand_elsewhere() -> None:
     """What is known of the place at one obstacle is known of that at the next but for the jitter of both."""
     memory, _ = silent((FIRST, STRAIGHT))
-    *_, after, _, _ = memory.step(*still(memory, [3.5, 3.1, 0.0, 1.0], 3))
+    *_, after, _, _, _ = memory.step(*still(memory, [3.5, 3.1, 0.0, 1.0], 3))
     added = torch.tensor(NEXT) + 0.05 * torch.tensor(DRIFT)
     torch.testing.assert_close(after[0, 12:15], added)
 
@@ -127,12 +143,12 @@ def test_who_reaches_the_last_way_point_stands_before_the_next_obstacle() -> Non
         (11, [4.5, 4.9, 0.0, -1.0], 11, [1.5, 0.1, 0.0, 1.0]),
     ):
         inputs = still(memory, pose, at)
-        *_, after, place, progress = memory.step(*inputs)
+        *_, after, place, progress, _ = memory.step(*inputs)
         torch.testing.assert_close(place[0, 4:], torch.tensor(expected), atol=1e-5, rtol=0.0)
         torch.testing.assert_close(after[0, 8:12], inputs[-1][0, 8:12], atol=1e-5, rtol=0.0)
         assert progress.exp()[0, follows] > 0.99
         torch.testing.assert_close(progress.exp().sum(), torch.tensor(1.0))
-        *_, twice = memory.step(*inputs[:3], after)
+        *_, twice, _ = memory.step(*inputs[:4], after)
         assert int(twice.argmax()) == follows, "who has left an obstacle does not leave the next one too"
 
 
@@ -141,7 +157,7 @@ def test_a_way_point_counts_until_it_is_reached() -> None:
     """The second way-point is at x = -0.5, and only where it is the present one is it passed."""
     memory, _ = silent((FIRST, STRAIGHT))
     for x, y, done in ((-1.5, 0.0, 0.0), (-0.88, 0.0, 0.5), (-0.8, 0.4, 0.0), (-0.5, 0.1, 1.0), (-0.2, 0.4, 1.0)):
-        *_, progress = memory.step(*still(memory, [2.0 + x, 3.0 + y, 0.0, 1.0], 1))
+        *_, progress, _ = memory.step(*still(memory, [2.0 + x, 3.0 + y, 0.0, 1.0], 1))
         assert float(progress.exp()[0, 2]) == pytest.approx(done, abs=0.02)
         assert float(progress.exp()[0, 1]) == pytest.approx(1.0 - done, abs=0.02)
 
@@ -154,7 +170,7 @@ def test_evidence_multiplies_the_belief() -> None:
     bias["weight"].fill_(4.0)
     *inputs, hidden = still(memory, [-9.0, 0.0, 0.0, 1.0], 1)
     hidden[0, -4] = math.log(3.0) - memory.prior[0]
-    *_, progress = memory.step(*inputs, hidden)
+    *_, progress, _ = memory.step(*inputs, hidden)
     assert float((progress[0, 0] - progress[0, 1]).exp()) == pytest.approx(3.0 / math.sqrt(6.0), rel=1e-2)
 
 
@@ -167,7 +183,7 @@ def test_evidence_moves_the_belief_to_a_neighbour() -> None:
         bias["weight"].fill_(100.0)
         *inputs, state = still(memory, [-9.0, 0.0, 0.0, 1.0], 0)
         for _ in range(3):
-            *_, state, _, progress = memory.step(*inputs, state)
+            *_, state, _, progress, _ = memory.step(*inputs, state)
         torch.testing.assert_close(progress.exp().sum(), torch.tensor(1.0))
         assert int(progress.argmax()) == follows
 
@@ -191,7 +207,7 @@ def test_evidence_speaks_for_another_obstacle_only_where_the_robot_can_be() -> N
         bias["progress"][4:8] = 4.0
         *inputs, state = still(memory, [x, y, 0.0, 1.0], at)
         for _ in range(5):
-            *_, state, _, progress = memory.step(*inputs, state)
+            *_, state, _, progress, _ = memory.step(*inputs, state)
         torch.testing.assert_close(progress.exp().sum(), torch.tensor(1.0))
         assert (int(progress.argmax()) // 4 == 1) == moves, (x, y, at)
 
@@ -203,7 +219,9 @@ def test_an_episode_begins_before_the_first_obstacle_unless_told_otherwise() -> 
     for start, leg in ((None, 0), (torch.eye(12)[[8, 0]], 2)):
         begun = memory.begun(hidden, first, start)
         assert torch.equal(begun[1], hidden[1])
-        *_, place, progress = memory.step(torch.zeros(2, 32), torch.zeros(2, 45), torch.zeros(2, 4), begun)
+        *_, place, progress, _ = memory.step(
+            torch.zeros(2, 32), torch.zeros(2, 45), torch.zeros(2, 4), torch.zeros(2, 58, 87), begun
+        )
         torch.testing.assert_close(place[0, 4:], torch.tensor([-1.5, 0.0, 0.0, 1.0]), atol=1e-6, rtol=0.0)
         assert float(progress[0].exp().unflatten(0, (3, 4)).sum(-1)[leg]) > 0.99
 
@@ -223,7 +241,7 @@ def test_way_points_are_those_of_the_likeliest_obstacle_and_then_where_the_next_
     bias["obstacle"][3] = 20.0
     # The entry is the mean over the types: at -1.5 in the frame of the second obstacle, which is 4 m on.
     for at, expected in ((0, [-0.5, 0.5, 0.5, 0.5]), (3, [2.5, 0.5, 2.5, -0.5]), (7, [6.5, 0.5, 6.5, 0.5])):
-        *_, place, _ = memory.step(*still(memory, [2.0, 3.5, 0.0, 1.0], at))
+        *_, place, _, _ = memory.step(*still(memory, [2.0, 3.5, 0.0, 1.0], at))
         torch.testing.assert_close(place[0, :4], torch.tensor(expected), atol=1e-5, rtol=0.0)
 
 
@@ -233,7 +251,8 @@ def test_gradients_reach_what_was_said_earlier() -> None:
     feature = torch.randn(6, 2, 32, requires_grad=True)
     first = torch.zeros(6, 2, 1, dtype=torch.bool)
     first[3, 0] = True
-    *_, place, _ = memory(feature, torch.randn(6, 2, 45), torch.randn(6, 2, 4), torch.randn(1, 2, memory.size), first)
+    seen = torch.randn(6, 2, 45), torch.randn(6, 2, 4), torch.zeros(6, 2, 58, 87)
+    *_, place, _, _ = memory(feature, *seen, torch.randn(1, 2, memory.size), first)
     place[5].sum().backward()
     assert (feature.grad[3:].abs().sum(-1) > 0).all() and (feature.grad[:3, 1].abs().sum(-1) > 0).all()
     assert (feature.grad[:3, 0] == 0).all(), "an episode does not remember the one before it"

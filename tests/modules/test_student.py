@@ -11,11 +11,13 @@ from agility_rl.modules import RecurrentStudent, Teacher
 M = 16
 """Units of memory in the tests."""
 WAY_POINTS = [[[x, 0.0] for x in (-1.5, -0.5, 0.5, 1.5)] for _ in range(7)]
+BALL = ["sphere", [0.4], [0.0, 0.0, 0.4], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0]]
 
 
-@pytest.fixture(params=[0, 8], ids=["headings only", "place"])
+@pytest.fixture(params=[(0, []), (8, []), (8, [[BALL]] * 7)], ids=["headings only", "place", "shapes"])
 def either(request: pytest.FixtureRequest) -> RecurrentStudent:
-    return RecurrentStudent(num_place=request.param, memory=M, way_points=WAY_POINTS)
+    num_place, solids = request.param
+    return RecurrentStudent(num_place=num_place, memory=M, way_points=WAY_POINTS, solids=solids)
 
 
 @pytest.fixture
@@ -94,6 +96,18 @@ def test_a_window_unrolled_is_what_single_steps_give_with_beginnings_anywhere(ei
     written = [("memory", "hidden"), "terrain_latent", "heading_estimate", "obstacle_logits", "logits", "loc"]
     for key in [*written, *(["place_estimate"] if student.settings["num_place"] else [])]:
         torch.testing.assert_close(unrolled[key], expected[key], rtol=1e-4, atol=1e-5)
+
+
+def test_what_was_matched_when_it_was_seen_stands_for_the_images() -> None:
+    student = RecurrentStudent(num_place=8, memory=M, way_points=WAY_POINTS, solids=[[BALL]] * 7)
+    seen = student.policy(sequence=True)(steps(3, 4, student.memory.size))
+    again = student.policy(sequence=True, seen=True)(seen.select(*student.policy(seen=True).in_keys).clone())
+    for key in ("place_estimate", "logits", ("memory", "hidden")):
+        torch.testing.assert_close(again[key], seen[key])
+    seen["scan_match"][..., :2] += 0.3
+    seen["scan_match"][..., 4:] = 1e-3
+    moved = student.policy(sequence=True, seen=True)(seen.select(*student.policy(seen=True).in_keys).clone())
+    assert not torch.allclose(moved["place_estimate"], again["place_estimate"], atol=0.05)
 
 
 def test_an_episode_does_not_remember_the_one_before_it(either: RecurrentStudent) -> None:
@@ -180,6 +194,8 @@ def test_from_a_teacher_that_reads_its_place() -> None:
 def test_who_infers_a_place_knows_the_obstacles() -> None:
     with pytest.raises(ValueError, match="expected way_points of 7 types of obstacles, got 0"):
         RecurrentStudent(num_place=8)
+    with pytest.raises(ValueError, match="expected solids of 7 types of obstacles, got 1"):
+        RecurrentStudent(num_place=8, way_points=WAY_POINTS, solids=[[BALL]])
     with pytest.raises(ValueError, match="num_place must be 0 or 8, got 3"):
         RecurrentStudent(num_place=3)
 

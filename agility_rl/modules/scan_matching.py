@@ -1,0 +1,218 @@
+"""Where an obstacle of known shape stands, from the depths that one image measures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from agility_rl.go2 import camera, constants
+from agility_rl.modules.distance_field import DistanceField, Solid
+from agility_rl.modules.glance import NUM_POSE, NUM_SCALES
+from agility_rl.modules.planar import attitude, inverted, moved, planar_motion
+
+NUM_MATCH = NUM_POSE + NUM_SCALES
+"""Numbers of a match: where the obstacle is seen, and the variances of that."""
+LATENCY = constants.CONTROL_DT
+"""Age of an image when it is matched [s]: one frame (method notes, section 5.8)."""
+STRIDE = 2
+"""Every second pixel, each way, is looked at."""
+NEAREST, FARTHEST = 0.5, 3.9
+"""Depths that count [m]: what is nearer may be the robot's own leg, what is farther nothing."""
+RAISED, GROUND = 192, 64
+"""So many points above the ground, and on it, are matched."""
+ABOVE, BELOW = 0.06, 1.6
+"""Heights above the ground of the former [m]."""
+STEPS = 4
+"""Of Gauss and Newton."""
+WIDTH = (0.1, 0.04)
+"""Distance to the surface at which a point counts for a quarter [m]: in the first step, in the last."""
+DEVIATION = 0.05
+"""Of a point's distance from the surface [m]; larger than that of a pixel, since neighbours err alike."""
+EXPECTED = (0.5, 0.5, 0.2, 0.05, 0.05, 0.015, 0.029)
+"""Deviations of what is expected: x, y [m] and yaw [rad] of the robot at the obstacle, its height [m], pitch with that
+of the camera, and roll [rad], and what all depths of an image are off by [m] (uniform within 0.05, and the mounting
+angle within 5 degrees: method notes, section 5.8)."""
+LEAST, SHARE, FAR = 15, 0.3, 0.8
+"""A match counts if it explains so many of the raised points, such a share of them, and lies less than so far [m] from
+where it was expected."""
+FLOOR = (0.015, 0.015, 0.008)
+"""Least deviation of a match: x, y [m], yaw [rad]."""
+NOTHING = 1e6
+"""Variance of what says nothing."""
+
+
+class ScanMatcher(nn.Module):
+    r"""Match the depths of an image with the known shape of an obstacle, from where that is expected.
+
+    .. math:: \min_\xi \sum_i w_i\, d(T(\xi)\, p_i)^2 / \sigma^2 + (\xi - \xi_0)^\top \Sigma_0^{-1} (\xi - \xi_0),
+              \qquad w_i = \left(1 + d_i^2 / c^2\right)^{-2}
+
+    :math:`p_i` are points that the image measures, d their distance from the surface of obstacle and ground
+    (:class:`~agility_rl.modules.distance_field.DistanceField`), and :math:`\xi` is the robot's pose at the obstacle
+    with its height, roll and pitch and the image's common error. Four steps of Gauss and Newton with weights of Geman
+    and McClure, whose width c falls. A network that reads a place from an image errs alike in image after image, and
+    holds what is usual for seen; a shape that fits does neither. It has to be expected within some 0.3 m.
+
+    Source: ours; scan matching against a distance field: Fitzgibbon 2003 (doi:10.1016/j.imavis.2003.09.004).
+
+    Args:
+        types: the solids of every type of obstacle, ``[K][...]``.
+
+    Example:
+        >>> wall = ("box", (0.1, 1.0, 0.5), (0.0, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0))
+        >>> matcher = ScanMatcher([[wall]])
+        >>> image = torch.full((1, 58, 87), 1.6)  # what stands 1.6 m before the camera fills it
+        >>> depth, still = camera.normalize_depth(image), torch.zeros(1, 45)
+        >>> expected = torch.tensor([[1.9, 0.0, 0.0, 1.0]])  # the wall's middle: its front is nearer by 0.1 m
+        >>> match = matcher(depth, still, torch.tensor([[0.27, 0.0, 0.0, 0.0]]), expected, torch.tensor([0]))
+        >>> round(match[0, 0].item(), 1), bool(match[0, 4] < 0.1**2)
+        (2.0, True)
+    """
+
+    rays: Tensor
+    mount: Tensor
+    order: Tensor
+    expected: Tensor
+    floor: Tensor
+
+    def __init__(self, types: Sequence[Sequence[Solid]]) -> None:
+        super().__init__()
+        self.field = DistanceField(types)
+        rays = camera.pixel_directions()[::STRIDE, ::STRIDE].flatten(0, 1)
+        shuffled = torch.rand(len(rays), generator=torch.Generator().manual_seed(0))
+        for name, value in {
+            "rays": rays,
+            "mount": torch.tensor(camera.POSITION),
+            "order": 0.5 * shuffled,  # which points are taken where there are too many
+            "expected": torch.tensor(EXPECTED),
+            "floor": torch.tensor(FLOOR),
+        }.items():
+            self.register_buffer(name, value, persistent=False)
+
+    @torch.no_grad()
+    def forward(
+        self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor, kind: Tensor
+    ) -> Tensor:
+        """Where obstacles are seen, and how sure that is.
+
+        Args:
+            depth: images ``[N, 58, 87]``, normalised or as they are stored.
+            proprioception: ``[N, 45]``.
+            estimate: ``[N, 4]``, the robot's height and velocity (:data:`agility_rl.keys.ESTIMATE`).
+            expected: ``[N, 4]``: x, y [m], sine and cosine of the yaw of the obstacle, seen by the robot.
+            kind: type of obstacle, int64 ``[N]``.
+
+        Returns:
+            ``[N, 7]``: as ``expected``, and variances of x, y [m^2] and yaw [rad^2], :data:`NOTHING` without a match.
+        """
+        motion = LATENCY * planar_motion(proprioception, estimate)
+        roll_pitch, rates = attitude(proprioception)
+        roll, pitch = (roll_pitch - LATENCY * rates[..., :2]).unbind(-1)
+        robot = moved(inverted(expected), -motion)
+        height, yaw = estimate[:, 0], torch.atan2(robot[:, 2], robot[:, 3])
+        start = torch.stack((robot[:, 0], robot[:, 1], yaw, height, pitch, roll, torch.zeros_like(roll)), -1)
+        points, rays, valid = self._points(depth, height, roll, pitch)
+        found = start
+        for step in range(STEPS):
+            width = WIDTH[0] * (WIDTH[1] / WIDTH[0]) ** (step / (STEPS - 1))
+            here, jacobian = _placed(found, points, rays)
+            distance, gradient, covered = self.field(kind, here)
+            weight = (1.0 + (distance / width).square()).reciprocal().square() * (valid & covered)
+            slope = (jacobian * gradient[..., None, :]).sum(-1)
+            information = torch.diag(self.expected.square().reciprocal())
+            normal = (slope * weight[..., None]).mT @ slope / DEVIATION**2 + information
+            residual = (slope * (weight * distance)[..., None]).sum(-2) / DEVIATION**2
+            covariance = inverted_spd(normal)
+            pull = residual + (found - start) / self.expected.square()
+            found = found - (covariance @ pull[..., None])[..., 0]
+        raised = here[..., 2] > ABOVE
+        explained = (weight * raised).sum(-1)
+        there = (valid & covered & raised).sum(-1)
+        pose = torch.cat((found[:, :2], found[:, 2:3].sin(), found[:, 2:3].cos()), -1)
+        seen = inverted(moved(pose, motion))
+        near = torch.linalg.vector_norm((found - start)[:, :2], dim=-1) < FAR
+        counts = (explained > LEAST) & (explained > SHARE * there) & near
+        variance = _seen_variance(covariance[:, :3, :3], pose, seen) + self.floor.square()
+        return torch.cat((seen, torch.where(counts[:, None], variance, NOTHING)), -1)
+
+    def _points(self, depth: Tensor, height: Tensor, roll: Tensor, pitch: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Points in the trunk's frame and their rays, ``[N, P, 3]``, and which of them were measured."""
+        metres = camera.metres(depth[..., ::STRIDE, ::STRIDE]).flatten(1)
+        points = metres[..., None] * self.rays + self.mount
+        up = torch.stack((-pitch.sin(), pitch.cos() * roll.sin(), pitch.cos() * roll.cos()), -1)
+        above = (points @ up[..., None])[..., 0] + height[:, None]
+        measured = (metres > NEAREST) & (metres < FARTHEST)
+        raised = (above > ABOVE) & (above < BELOW)
+        chosen = [
+            (self.order + (measured & these)).topk(count, -1).indices
+            for these, count in ((raised, RAISED), (~raised, GROUND))
+        ]
+        index = torch.cat(chosen, -1)
+        fits = torch.cat((raised.gather(-1, chosen[0]), ~raised.gather(-1, chosen[1])), -1)
+        rows = index[..., None].expand(-1, -1, 3)
+        return points.gather(1, rows), self.rays[index], measured.gather(-1, index) & fits
+
+
+def _placed(pose: Tensor, points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Points of the trunk's frame at the obstacle, ``[N, P, 3]``, and how they move with the pose, ``[N, P, 7, 3]``."""
+    x, y, yaw, height, pitch, roll, off = (value[:, None] for value in pose.unbind(-1))
+
+    def rolled(v: Tensor) -> Tensor:
+        a, b, c = v.unbind(-1)
+        return torch.stack((a, roll.cos() * b - roll.sin() * c, roll.sin() * b + roll.cos() * c), -1)
+
+    def pitched(v: Tensor) -> Tensor:
+        a, b, c = v.unbind(-1)
+        return torch.stack((pitch.cos() * a + pitch.sin() * c, b, pitch.cos() * c - pitch.sin() * a), -1)
+
+    def turned(v: Tensor) -> Tensor:
+        a, b, c = v.unbind(-1)
+        return torch.stack((yaw.cos() * a - yaw.sin() * b, yaw.sin() * a + yaw.cos() * b, c), -1)
+
+    leaning = rolled(points + off[..., None] * rays)
+    upright = pitched(leaning)
+    ahead = turned(upright)
+    zero, one = torch.zeros_like(ahead[..., 0]), torch.ones_like(ahead[..., 0])
+    moves = (
+        torch.stack((one, zero, zero), -1),
+        torch.stack((zero, one, zero), -1),
+        torch.stack((-ahead[..., 1], ahead[..., 0], zero), -1),
+        torch.stack((zero, zero, one), -1),
+        turned(torch.stack((upright[..., 2], zero, -upright[..., 0]), -1)),
+        turned(pitched(torch.stack((zero, -leaning[..., 2], leaning[..., 1]), -1))),
+        turned(pitched(rolled(rays))),
+    )
+    shift = torch.stack((x + 0.0 * zero, y + 0.0 * zero, height + 0.0 * zero), -1)
+    return ahead + shift, torch.stack(moves, -2)
+
+
+def _seen_variance(covariance: Tensor, robot: Tensor, seen: Tensor) -> Tensor:
+    """Variances ``[N, 3]`` of an obstacle as the robot sees it, from the covariance ``[N, 3, 3]`` of its pose there."""
+    sine, cosine = robot[:, 2], robot[:, 3]
+    zero = torch.zeros_like(sine)
+    rows = ((-cosine, -sine, seen[:, 1]), (sine, -cosine, -seen[:, 0]), (zero, zero, zero - 1.0))
+    lever = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    return ((lever @ covariance) * lever).sum(-1)
+
+
+def inverted_spd(matrix: Tensor) -> Tensor:
+    """Inverse of small symmetric positive definite matrices ``[*B, n, n]``, in operations that ONNX has too.
+
+    Source: sweep operator (Beaton 1964; Goodnight 1979, doi:10.1080/00031305.1979.10482685).
+
+    Example:
+        >>> inverted_spd(torch.tensor([[2.0, 1.0], [1.0, 3.0]]))
+        tensor([[ 0.6000, -0.2000],
+                [-0.2000,  0.4000]])
+    """
+    size = matrix.shape[-1]
+    unit = torch.eye(size, dtype=matrix.dtype, device=matrix.device)
+    for index in range(size):
+        column, axis = matrix[..., index], unit[index]
+        pivot, others = column[..., index, None, None], (column * (1.0 - axis))[..., None]
+        crossed = others * axis
+        rest = (1.0 - axis) * (1.0 - axis)[:, None]
+        matrix = rest * matrix + (crossed + crossed.mT - others * others.mT - axis[:, None] * axis) / pivot
+    return -matrix

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from agility_rl import keys
+from agility_rl.envs import AgilityEnv
+from agility_rl.envs.course_presets import COURSES
+from agility_rl.envs.obstacles import OBSTACLES
+from agility_rl.go2 import camera
+from agility_rl.modules.planar import inverted
+from agility_rl.modules.scan_matching import FLOOR, NOTHING, ScanMatcher, inverted_spd
+
+ROBOTS = 24
+SOLIDS = [kind.solids() for kind in OBSTACLES.values()]
+TAUGHT = [name for name in OBSTACLES if name != "box_jump"]
+
+
+@pytest.fixture(scope="module")
+def matcher() -> ScanMatcher:
+    return ScanMatcher(SOLIDS)
+
+
+def standing(name: str, noise: float = 0.0) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
+    """What robots that have just been stood before an obstacle measure, where they see it, and its type."""
+    camera_errors = {"pitch": noise * camera.PITCH_JITTER, "offset_noise": 0.05 * noise, "pixel_noise": 0.05 * noise}
+    env = AgilityEnv(
+        ROBOTS,
+        lambda td: td.set("action", torch.zeros(ROBOTS, 12)),
+        COURSES[name],
+        depth=camera_errors,
+        start_spread=2.0,
+        observation_noise=0.0,
+        simulator_options={"num_threads": 2},
+        seed=3,
+    )
+    td = env.reset()
+    estimate = torch.cat((env.simulator.root_position[:, 2:], torch.zeros(ROBOTS, 3)), -1)
+    seen = inverted(td[keys.PLACE][:, 4:])
+    env.close()
+    return (td[keys.DEPTH], td[keys.PROPRIOCEPTION], estimate), seen, td[keys.OBSTACLE].argmax(-1)
+
+
+def beside(seen: Tensor, seed: int = 0) -> Tensor:
+    """The same, expected up to 0.15 m and 0.06 rad elsewhere."""
+    off = 2.0 * torch.rand(len(seen), 3, generator=torch.Generator().manual_seed(seed)) - 1.0
+    yaw = torch.atan2(seen[:, 2], seen[:, 3]) + 0.06 * off[:, 2]
+    return torch.cat((seen[:, :2] + 0.15 * off[:, :2], yaw.sin()[:, None], yaw.cos()[:, None]), -1)
+
+
+def errors(match: Tensor, seen: Tensor) -> Tensor:
+    """Of x, y [m] and yaw [rad], ``[N, 3]``."""
+    yaw = torch.asin((match[:, 2] * seen[:, 3] - match[:, 3] * seen[:, 2]).clamp(-1.0, 1.0))
+    return torch.cat((match[:, :2] - seen[:, :2], yaw[:, None]), -1).abs()
+
+
+@pytest.mark.parametrize("name", TAUGHT)
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_an_obstacle_is_found_where_it_stands(matcher: ScanMatcher, name: str, noise: float) -> None:
+    """Without errors of the camera to the grid of the field; with all of them far nearer than it was expected."""
+    measured, seen, kind = standing(name, noise)
+    expected = beside(seen)
+    match = matcher(*measured, expected, kind)
+    found = match[:, 4] < NOTHING
+    assert found.float().mean() > 0.7
+    before, after = (errors(place, seen)[found].median(0).values for place in (expected, match))
+    assert (after < torch.tensor([0.9, 0.5, 0.8]) * before).all(), (before, after)
+    assert (after < torch.tensor([0.07, 0.03, 0.03])).all(), after
+    deviation = match[found, 4:].sqrt()
+    assert (deviation >= torch.tensor(FLOOR)).all() and (deviation.median(0).values < 0.2).all()
+
+
+def test_who_sees_nothing_is_told_nothing(matcher: ScanMatcher) -> None:
+    (_, proprioception, estimate), seen, kind = standing("tunnel")
+    far = torch.full((ROBOTS, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH), 0.5)
+    match = matcher(far, proprioception, estimate, seen, kind)
+    assert (match[:, 4:] == NOTHING).all()
+    torch.testing.assert_close(match[:, :4], seen, atol=1e-4, rtol=0.0)
+
+
+def test_another_obstacle_is_not_taken_for_it(matcher: ScanMatcher) -> None:
+    """A tunnel in view, a hurdle expected 2 m farther on."""
+    measured, seen, kind = standing("tunnel")
+    expected = seen + torch.tensor([2.0, 0.0, 0.0, 0.0])
+    match = matcher(*measured, expected, torch.zeros_like(kind))
+    assert (match[:, 4] == NOTHING).float().mean() > 0.7
+
+
+def test_rows_do_not_mix_and_stored_images_say_the_same(matcher: ScanMatcher) -> None:
+    (depth, proprioception, estimate), seen, kind = standing("tire_jump", 1.0)
+    expected = beside(seen)
+    match = matcher(depth, proprioception, estimate, expected, kind)
+    alone = matcher(depth[3:4], proprioception[3:4], estimate[3:4], expected[3:4], kind[3:4])
+    torch.testing.assert_close(alone[0], match[3], rtol=1e-3, atol=1e-4)
+    stored = matcher(camera.quantize(depth, 16), proprioception, estimate, expected, kind)
+    assert errors(stored, match).median() < 1e-3
+    assert not matcher(depth.requires_grad_(), proprioception, estimate, expected, kind).requires_grad
+
+
+def test_inverse_of_badly_scaled_matrices() -> None:
+    factor = torch.randn(20, 7, 9, generator=torch.Generator().manual_seed(0))
+    matrix = factor @ factor.mT + torch.diag(torch.tensor([4.0, 4.0, 25.0, 400.0, 400.0, 4444.0, 1189.0]))
+    torch.testing.assert_close(inverted_spd(matrix) @ matrix, torch.eye(7).expand(20, 7, 7), atol=1e-5, rtol=0.0)
