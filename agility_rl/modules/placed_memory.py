@@ -26,7 +26,7 @@ the released one (method notes, section 5.7)."""
 NEXT = (0.2**2, 0.29**2, 0.07**2)
 """Variance that the jitter of an obstacle and of the next one adds (section 5.7): 0.15 m along, 0.25 m across and 0.087
 rad at most, of each; what stands 4 m behind one that is turned so far is 0.35 m aside."""
-ALIKE = 2.7
+ALIKE = 3.2
 """Logarithm of how many images in a row count as one at the start: their errors are alike."""
 CREDIT = -4.0
 """Added to the logit of the evidence's share: at the start a second of images, much alike, counts as half of one."""

@@ -39,6 +39,9 @@ LEAST, SHARE, FAR = 15, 0.3, 0.8
 where it was expected."""
 FLOOR = (0.015, 0.015, 0.008)
 """Least deviation of a match: x, y [m], yaw [rad]."""
+HELD = (1.0, 0.1, 0.1)
+"""Factors on the variances of a match: edges hold it across and in yaw better than slopes at the solution tell, since
+there points only begin to leave the surface (docs/student.md)."""
 NOTHING = 1e6
 """Variance of what says nothing."""
 
@@ -76,6 +79,7 @@ class ScanMatcher(nn.Module):
     order: Tensor
     expected: Tensor
     floor: Tensor
+    held: Tensor
 
     def __init__(self, types: Sequence[Sequence[Solid]]) -> None:
         super().__init__()
@@ -88,6 +92,7 @@ class ScanMatcher(nn.Module):
             "order": 0.5 * shuffled,  # which points are taken where there are too many
             "expected": torch.tensor(EXPECTED),
             "floor": torch.tensor(FLOOR),
+            "held": torch.tensor(HELD),
         }.items():
             self.register_buffer(name, value, persistent=False)
 
@@ -134,7 +139,7 @@ class ScanMatcher(nn.Module):
         seen = inverted(moved(pose, motion))
         near = torch.linalg.vector_norm((found - start)[:, :2], dim=-1) < FAR
         counts = (explained > LEAST) & (explained > SHARE * there) & near
-        variance = _seen_variance(covariance[:, :3, :3], pose, seen) + self.floor.square()
+        variance = self.held * _seen_variance(covariance[:, :3, :3], pose, seen) + self.floor.square()
         return torch.cat((seen, torch.where(counts[:, None], variance, NOTHING)), -1)
 
     def _points(self, depth: Tensor, height: Tensor, roll: Tensor, pitch: Tensor) -> tuple[Tensor, Tensor, Tensor]:
