@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from agility_rl.modules.distance_field import Solid
 from agility_rl.modules.glance import NUM_POSE, NUM_SCALES, Glance
+from agility_rl.modules.kalman import corrected
 from agility_rl.modules.mlp import mlp
 from agility_rl.modules.planar import bearings, inverse, inverted, moved, planar_motion, seen_from, within
 from agility_rl.modules.scan_matching import NOTHING, NUM_MATCH, ScanMatcher
@@ -60,10 +61,10 @@ class PlacedMemory(nn.Module):
     gyroscope, attitude and estimated velocity give it (:func:`~agility_rl.modules.planar.planar_motion`,
     :func:`~agility_rl.modules.planar.moved`); Q is what that adds in uncertainty. A
     :class:`~agility_rl.modules.glance.Glance` says where the obstacle ahead is seen and how sure that is, by which the
-    pose is :func:`corrected`; then by where the shape of that type of obstacle fits what the image measures, as far as
-    it is in view (:class:`~agility_rl.modules.scan_matching.ScanMatcher`). A GRU, which sees the feature,
-    proprioception, what is expected of the place, and b, says how many images in a row count as one, and adds to what
-    the glance says of terrain latent, obstacle and e.
+    pose is :func:`~agility_rl.modules.kalman.corrected`; then by where the shape of that type of obstacle fits what the
+    image measures, as far as it is in view (:class:`~agility_rl.modules.scan_matching.ScanMatcher`). A GRU, which sees
+    the feature, proprioception, what is expected of the place, and b, says how many images in a row count as one, and
+    adds to what the glance says of terrain latent, obstacle and e.
 
     The course is known but for its jitter and the order of its obstacles. b is the belief of a hidden Markov model in
     the way-point that is the present one, of all obstacles of all routes: N goes on to the next one, :math:`\lambda`
@@ -172,11 +173,10 @@ class PlacedMemory(nn.Module):
         is_init: Tensor,
         start: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """Steps of ``[T, *B]``: terrain latent, heading errors [rad], obstacle logits, memory after, place, progress,
-        match.
+        """Steps of ``[T, *B]``: latent, heading errors [rad], obstacle logits, memory after, place, progress, match.
 
-        Progress are log-probabilities. A ``look`` is an image ``[58, 87]``, or the match that came of it when it was
-        seen. Of ``hidden`` only the first step's counts; it begins as :meth:`begun` does.
+        Progress are log-probabilities. ``look`` is an image ``[58, 87]``, or the match that came of it.
+        Of ``hidden`` only the first step's counts; it begins as :meth:`begun` does.
         """
         state, steps = hidden[0], []
         for time, measured in enumerate(zip(feature, proprioception, estimate, look, strict=True)):
@@ -322,58 +322,6 @@ def told_of(belief: Tensor, evidence: Tensor, possible: Tensor) -> Tensor:
     gain = torch.where(possible, gain, torch.minimum(gain, gain_now))
     told = (leg + gain)[..., None] + after.log_softmax(-1)
     return told - told.flatten(-2).logsumexp(-1)[..., None, None]
-
-
-def corrected(expected: Tensor, variance: Tensor, said: Tensor, unsure: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Where an obstacle is seen and the variance of that, after something was said of it, with how sure that is.
-
-    .. math:: k = \frac{\bar P}{\bar P + R}\, c(m, \bar o), \qquad o = \bar o + k\, (m - \bar o), \qquad
-              P = (1 - k)\, \bar P
-
-    Sine and cosine of the yaw share a variance. What is said of a place far from the one expected is of another
-    obstacle: c is how :func:`credible` it is.
-
-    Source: Kalman 1960 (doi:10.1115/1.3662552). A glance's R is :math:`2 e^{2 s}`, the variance of Laplace's
-    distribution.
-
-    Args:
-        expected: ``[*B, 4]``: x, y [m], sine and cosine of the yaw of the obstacle, seen by the robot.
-        variance: ``[*B, 3]``, of x, y [m^2] and yaw [rad^2].
-        said: ``[*B, 4]``, as the first.
-        unsure: ``[*B, 3]``, variance of that, R.
-
-    Example:
-        >>> here, there = torch.tensor([2.0, 0.0, 0.0, 1.0]), torch.tensor([2.1, 0.1, 0.0, 1.0])
-        >>> place, variance = corrected(here, torch.full((3,), 0.02), there, torch.tensor([0.02, 0.18, 2.0]))
-        >>> place.round(decimals=2), variance.round(decimals=3)
-        (tensor([2.0500, 0.0100, 0.0000, 1.0000]), tensor([0.0100, 0.0180, 0.0200]))
-    """
-    gain = variance / (variance + unsure) * credible(said, expected)
-    position, yaw = torch.lerp(expected, said, torch.cat((gain, gain[..., 2:]), -1)).split(2, -1)
-    return torch.cat((position, nn.functional.normalize(yaw, dim=-1)), -1), (1.0 - gain) * variance
-
-
-def credible(said: Tensor, expected: Tensor) -> Tensor:
-    r"""How far something said of an obstacle's place is believed, by its distance from what was expected.
-
-    .. math:: 1 / (1 + d^4 / 1\,\mathrm{m}^4)
-
-    Source: ours; a soft form of the validation gate of target tracking.
-
-    Args:
-        said: ``[*B, 4]``: x, y [m] first.
-        expected: ``[*B, 4]``, as the first.
-
-    Returns:
-        ``[*B, 1]``, without gradient.
-
-    Example:
-        >>> here = torch.tensor([0.0, 0.0, 0.0, 1.0])
-        >>> [round(credible(torch.tensor([x, 0.0, 0.0, 1.0]), here).item(), 3) for x in (0.3, 1.0, 4.0)]
-        [0.992, 0.5, 0.004]
-    """
-    distance = torch.linalg.vector_norm((said - expected)[..., :2].detach(), dim=-1, keepdim=True)
-    return 1.0 / (1.0 + distance**4)
 
 
 def reached(offset: Tensor) -> Tensor:
