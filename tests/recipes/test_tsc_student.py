@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from agility_rl import keys
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.deploy.task import describe_camera
+from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import camera
 from agility_rl.modules import RecurrentStudent
 from agility_rl.modules.planar import inverted, moved
@@ -50,6 +51,7 @@ def test_a_run_writes_a_student_and_what_it_saw(
     assert manifest["camera"]["training"]["latency"] == [1, 1] and manifest["byol"] is True
     student = RecurrentStudent(**manifest["network"])
     student.load_state_dict(artifact.state)
+    assert student.settings["solids"] == [kind.solids() for kind in OBSTACLES.values()]
     scalars = read_scalars(run)
     losses = ("behaviour", "parameters", "heading", "obstacle", "place", "latent", "byol")
     for name in (*(f"loss_{loss}" for loss in losses), "spread"):
@@ -116,6 +118,7 @@ def test_glances_move_the_encoder_and_the_imitation_the_rest(recipe: ModuleType,
     window = parts.collector.collect()
     feature = parts.student.depth_encoder(window[0].select("depth"))["depth_feature"]
     torch.testing.assert_close(window["depth_feature"][0], feature)
+    assert window["scan_match"].shape == (*window.shape, 7), "matched when it was seen, not with every pass"
     glances = module("glances")
     window["label", "terrain_latent"] = glances.known_terrain(parts.teacher, window)
     recipe.imitate(parts, cfg, window, 0)
