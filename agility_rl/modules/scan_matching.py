@@ -64,14 +64,15 @@ class ScanMatcher(nn.Module):
         types: the solids of every type of obstacle, ``[K][...]``.
 
     Example:
-        >>> wall = ("box", (0.1, 1.0, 0.5), (0.0, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0))
-        >>> matcher = ScanMatcher([[wall]])
-        >>> image = torch.full((1, 58, 87), 1.6)  # what stands 1.6 m before the camera fills it
-        >>> depth, still = camera.normalize_depth(image), torch.zeros(1, 45)
-        >>> expected = torch.tensor([[1.9, 0.0, 0.0, 1.0]])  # the wall's middle: its front is nearer by 0.1 m
-        >>> match = matcher(depth, still, torch.tensor([[0.27, 0.0, 0.0, 0.0]]), expected, torch.tensor([0]))
+        >>> block = ("box", (0.4, 1.4, 0.8), (0.0, 0.0, 0.8), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0))
+        >>> matcher = ScanMatcher([[block]])
+        >>> ground = (0.27 + camera.POSITION[2]) / (-camera.pixel_directions()[..., 2]).clamp(min=1e-6)
+        >>> depth = camera.normalize_depth(ground.clamp(max=1.6))[None]  # 1.6 m before the camera a block begins
+        >>> still, standing = torch.zeros(1, 45), torch.tensor([[0.27, 0.0, 0.0, 0.0]])
+        >>> expected = torch.tensor([[2.2, 0.0, 0.0, 1.0]])  # its middle, which is 0.1 m farther on
+        >>> match = matcher(depth, still, standing, expected, torch.tensor([0]))
         >>> round(match[0, 0].item(), 1), bool(match[0, 4] < 0.1**2)
-        (2.0, True)
+        (2.3, True)
     """
 
     rays: Tensor
