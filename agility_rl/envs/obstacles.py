@@ -85,8 +85,9 @@ class Obstacle:
     target_speed: float = WALK_SPEED
 
     def solids(self) -> list[list[Any]]:
-        """What it is made of, as :class:`~agility_rl.modules.distance_field.DistanceField` reads it: kind, size,
-        position, quaternion, and the range of heights to which that may be lifted; a hinge as nobody stands on it.
+        """What it is made of, as :class:`~agility_rl.modules.distance_field.DistanceField` reads it: kind, size and
+        position [m], quaternion (w, x, y, z), and the range of heights [m] to which that may be lifted, in the
+        obstacle's frame; a hinge as nobody stands on it.
 
         Example:
             >>> OBSTACLES["bar_jump"].solids()[-1]

@@ -63,6 +63,9 @@ def signed_distance(solid: Solid, points: Tensor) -> Tensor:
         solid: see :data:`Solid`.
         points: ``[*B, 3]``, in the obstacle's frame [m].
 
+    Returns:
+        ``[*B]`` [m].
+
     Raises:
         ValueError: if there is no such kind of solid.
 
@@ -128,15 +131,22 @@ class DistanceField(nn.Module):
     values: Tensor
     low: Tensor
     last: Tensor
+    strides: Tensor
+    corners: Tensor
 
     def __init__(self, types: Sequence[Sequence[Solid]]) -> None:
         super().__init__()
         values = _values(_frozen(types))
-        self.shape = values.shape
-        self.strides = values.stride()
-        self.register_buffer("values", values.flatten(), persistent=False)
-        self.register_buffer("low", torch.tensor(LOW), persistent=False)
-        self.register_buffer("last", torch.tensor(values.shape[1:]) - 1, persistent=False)
+        self.size, *strides = values.stride()
+        steps = torch.tensor(list(itertools.product((0, 1), repeat=3)))
+        for name, value in {
+            "values": values.flatten(),
+            "low": torch.tensor(LOW),
+            "last": torch.tensor(values.shape[1:]) - 1,
+            "strides": torch.tensor(strides),
+            "corners": (steps * torch.tensor(strides)).sum(-1),  # of a cell, from its first
+        }.items():
+            self.register_buffer(name, value, persistent=False)
 
     def forward(self, kind: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Distances ``[N, P]`` [m], gradients ``[N, P, 3]``, and whether they are known, of types int64 ``[N]`` at
@@ -145,12 +155,8 @@ class DistanceField(nn.Module):
         covered = ((cells >= 0.0) & (cells <= self.last)).all(-1)
         corner = torch.minimum(cells.clamp(min=0.0), self.last - 1e-3).long()
         share = cells - corner
-        stride_kind, *strides = self.strides
-        first = kind[:, None] * stride_kind
-        for axis, stride in enumerate(strides):
-            first = first + corner[..., axis] * stride
-        offsets = [sum(steps) for steps in itertools.product(*((0, stride) for stride in strides))]
-        at = self.values[torch.stack([first + offset for offset in offsets], -1)].unflatten(-1, (2, 2, 2))
+        first = kind[:, None] * self.size + (corner * self.strides).sum(-1)
+        at = self.values[first[..., None] + self.corners].unflatten(-1, (2, 2, 2))
         along_z, along_y, along_x = share[..., None, None, 2], share[..., None, 1], share[..., 0]
         on_z = torch.lerp(at[..., 0], at[..., 1], along_z)
         on_y = torch.lerp(on_z[..., 0], on_z[..., 1], along_y)

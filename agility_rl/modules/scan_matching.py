@@ -120,18 +120,18 @@ class ScanMatcher(nn.Module):
         height, yaw = estimate[:, 0], torch.atan2(robot[:, 2], robot[:, 3])
         start = torch.stack((robot[:, 0], robot[:, 1], yaw, height, pitch, roll, torch.zeros_like(roll)), -1)
         points, rays, valid = self._points(depth, height, roll, pitch)
-        found = start
+        found, unsure = start, self.expected.square()
+        known = torch.diag(unsure.reciprocal())
         for step in range(STEPS):
             width = WIDTH[0] * (WIDTH[1] / WIDTH[0]) ** (step / (STEPS - 1))
             here, jacobian = _placed(found, points, rays)
             distance, gradient, covered = self.field(kind, here)
             weight = (1.0 + (distance / width).square()).reciprocal().square() * (valid & covered)
             slope = (jacobian * gradient[..., None, :]).sum(-1)
-            information = torch.diag(self.expected.square().reciprocal())
-            normal = (slope * weight[..., None]).mT @ slope / DEVIATION**2 + information
+            normal = (slope * weight[..., None]).mT @ slope / DEVIATION**2 + known
             residual = (slope * (weight * distance)[..., None]).sum(-2) / DEVIATION**2
             covariance = inverted_spd(normal)
-            pull = residual + (found - start) / self.expected.square()
+            pull = residual + (found - start) / unsure
             found = found - (covariance @ pull[..., None])[..., 0]
         raised = here[..., 2] > ABOVE
         explained = (weight * raised).sum(-1)
@@ -164,18 +164,19 @@ class ScanMatcher(nn.Module):
 def _placed(pose: Tensor, points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
     """Points of the trunk's frame at the obstacle, ``[N, P, 3]``, and how they move with the pose, ``[N, P, 7, 3]``."""
     x, y, yaw, height, pitch, roll, off = (value[:, None] for value in pose.unbind(-1))
+    (sine_r, cosine_r), (sine_p, cosine_p), (sine_y, cosine_y) = ((a.sin(), a.cos()) for a in (roll, pitch, yaw))
 
     def rolled(v: Tensor) -> Tensor:
         a, b, c = v.unbind(-1)
-        return torch.stack((a, roll.cos() * b - roll.sin() * c, roll.sin() * b + roll.cos() * c), -1)
+        return torch.stack((a, cosine_r * b - sine_r * c, sine_r * b + cosine_r * c), -1)
 
     def pitched(v: Tensor) -> Tensor:
         a, b, c = v.unbind(-1)
-        return torch.stack((pitch.cos() * a + pitch.sin() * c, b, pitch.cos() * c - pitch.sin() * a), -1)
+        return torch.stack((cosine_p * a + sine_p * c, b, cosine_p * c - sine_p * a), -1)
 
     def turned(v: Tensor) -> Tensor:
         a, b, c = v.unbind(-1)
-        return torch.stack((yaw.cos() * a - yaw.sin() * b, yaw.sin() * a + yaw.cos() * b, c), -1)
+        return torch.stack((cosine_y * a - sine_y * b, sine_y * a + cosine_y * b, c), -1)
 
     leaning = rolled(points + off[..., None] * rays)
     upright = pitched(leaning)
@@ -190,8 +191,7 @@ def _placed(pose: Tensor, points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]
         turned(pitched(torch.stack((zero, -leaning[..., 2], leaning[..., 1]), -1))),
         turned(pitched(rolled(rays))),
     )
-    shift = torch.stack((x + 0.0 * zero, y + 0.0 * zero, height + 0.0 * zero), -1)
-    return ahead + shift, torch.stack(moves, -2)
+    return ahead + torch.stack((x, y, height), -1), torch.stack(moves, -2)
 
 
 def _seen_variance(covariance: Tensor, robot: Tensor, seen: Tensor) -> Tensor:

@@ -69,7 +69,7 @@ class Hinge:
     damping: float = 0.0
 
     def resting(self) -> list[tuple[Shape, tuple[float, ...], tuple[float, ...]]]:
-        """What turns, with position and quaternion in the frame of the piece at the lowest angle."""
+        """What turns, with position [m] and quaternion (w, x, y, z) in the frame of the piece, at the lowest angle."""
         half = 0.5 * self.limits[0]
         turn = torch.tensor([math.cos(half), *(math.sin(half) * along for along in self.axis)])
         placed = []

@@ -58,7 +58,7 @@ def errors(match: Tensor, seen: Tensor) -> Tensor:
 @pytest.mark.parametrize("name", TAUGHT)
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_an_obstacle_is_found_where_it_stands(matcher: ScanMatcher, name: str, noise: float) -> None:
-    """Without errors of the camera to the grid of the field; with all of them far nearer than it was expected."""
+    """Nearer to it than it was expected, without errors of the camera and with all of them."""
     measured, seen, kind = standing(name, noise)
     expected = beside(seen)
     match = matcher(*measured, expected, kind)
