@@ -29,7 +29,7 @@ from torch.optim.swa_utils import AveragedModel
 from torchrl.data import Unbounded
 from torchrl.envs import Compose, InitTracker, TensorDictPrimer, TransformedEnv
 from training_run import Laps, own_options, run
-from tsc_artifacts import load_bbc_of, load_trained
+from tsc_artifacts import load_bbc_of, load_trained, trained_bbc
 from tsc_config import CPU as TEACHER
 from tsc_config import CurriculumConfig, PPOConfig, RewardConfig
 from tsc_curriculum import Curriculum
@@ -239,6 +239,7 @@ def train(cfg: Config) -> Path:
         raise ValueError(
             f"--reward.imitation: practice pays for the task alone; expected 0, not {cfg.reward.imitation}"
         )
+    cfg = replace(cfg, bbc=cfg.bbc or trained_bbc(load_trained(cfg.student, "student")))
     return run(
         "tsc_practice",
         cfg,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -46,6 +47,14 @@ def test_a_run_changes_the_actor_and_nothing_else(recipe: ModuleType, smoke: Any
         assert bool(scalars[name][1].isfinite().all()), name
     assert "success/tunnel" not in scalars
     assert read_scalars(run)["kl_continuous"][1][0].abs() < 1e-3, "the first iteration leaves the policy as it is"
+
+
+def test_its_run_says_which_controller_it_found(
+    recipe: ModuleType, module: Module, smoke: Any, untrained: Path
+) -> None:
+    (smoke.student / "config.json").write_text(json.dumps({"config": {"bbc": str(untrained)}}), encoding="utf-8")
+    run = recipe.train(replace(smoke, bbc=None, iterations=1))
+    assert module("deciders").load_decider(run, None).controller.run == untrained
 
 
 def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smoke: Any) -> None:
