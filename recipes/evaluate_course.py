@@ -95,6 +95,8 @@ class Config:
     """Seconds between pushes (training of the paper: 8)."""
     noise: float = 0.0
     """Factor on the observation noise (training: 0)."""
+    misjudgement: float = 0.0
+    """Factor on how wrong a teacher is about its place and its obstacle, as a student is (``docs/student.md``)."""
     seed: int = 1000
     """Seed of courses and start places; training draws its own from another generator, so none of them was seen."""
     num_threads: int | None = None
@@ -128,6 +130,7 @@ def simulate(
         goal_radius=config.goal_radius,
         start="first",
         push_interval=config.push_interval,
+        misjudgement=config.misjudgement,
         seed=config.seed,
     )
     episodes = record_episodes(env, decider, quota, progress, disturbance, config.seed)
@@ -187,6 +190,8 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         decider = load_script(str(config.script), config.bbc, fastest)
     if decider.student is None and set(disturbances) != {"none"}:
         raise ValueError(f"--disturbance: {decider.name} has no camera to disturb; give a student")
+    if decider.student is not None and config.misjudgement:
+        raise ValueError(f"--misjudgement: {decider.name} misjudges its place by itself; give a teacher")
     cells = [(name, key) for name in names(config, decider) for key in disturbances]
     courses = {name: course_of(name) for name, _ in cells}
     output = config.output or decider.run or Path("runs") / decider.name

@@ -81,7 +81,7 @@ class AgilityEnv(EnvBase):
         start: before a random obstacle, or before the first.
         start_spread: how many times as far aside and turned as released (:class:`~agility_rl.envs.arena.Arena`).
         start_after: share of random starts that are where the obstacle before is left.
-        misjudgement: factor on how wrong ``place`` and ``heading_error`` are
+        misjudgement: factor on how wrong ``place``, ``heading_error`` and ``obstacle`` are
             (:class:`~agility_rl.envs.misjudgement.Misjudgement`; ours); 0: they are true.
         push_interval: seconds between pushes; ``None`` for none.
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].
@@ -251,10 +251,10 @@ class AgilityEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         decision = tensordict[keys.ACTION]
         self.decisions.decide(decision[keys.BEHAVIOUR], decision[keys.PARAMETERS])
-        outcome = self._outcome()
+        outcome, leg = self._outcome(), self.arena.progress.leg
         for _ in range(self.decision_steps):
             self._advance(outcome)
-        self.arena.advance()
+        self.arena.advance(leg, self.simulator.root_position[:, :2], self._robot.yaw)
         return self._observe(outcome)
 
     def _outcome(self) -> DecisionOutcome:

@@ -145,19 +145,23 @@ class Arena:
         if self.misjudgement is not None:
             self.misjudgement.begin(mask)
 
-    def advance(self) -> None:
-        """One decision later."""
+    def advance(self, before: Tensor, position: Tensor, yaw: Tensor) -> None:
+        """One decision after the robots were at legs ``before``, int64 ``[N]``; they are at ``[N, 2]`` [m] now."""
         if self.misjudgement is not None:
-            self.misjudgement.advance()
+            obstacle, changed = self.progress.obstacle, self.progress.leg != before
+            self.misjudgement.advance(changed, *self._at(obstacle, position, yaw))
+
+    def _at(self, obstacle: Tensor, position: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor]:
+        """Place ``[N, 2]`` [m] and yaw ``[N]`` [rad] in the frames of obstacles."""
+        return self.layout.local_to(obstacle, position), yaw - self.layout.axis(obstacle)
 
     def believed(self, position: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor]:
         """Where robots at ``[N, 2]`` [m] with headings ``[N]`` [rad] are told that they are."""
         if self.misjudgement is None:
             return position, yaw
         obstacle = self.progress.obstacle
-        axis = self.layout.axis(obstacle)
-        local, turned = self.misjudgement.misjudged(self.layout.local_to(obstacle, position), yaw - axis)
-        return self.layout.world(obstacle, local), axis + turned
+        local, turned = self.misjudgement.misjudged(*self._at(obstacle, position, yaw))
+        return self.layout.world(obstacle, local), self.layout.axis(obstacle) + turned
 
     def _stand(self, leg: Tensor) -> tuple[Tensor, Tensor]:
         """Obstacle by which the robots of legs ``[N]`` start, and where in its frame, int64 ``[N]`` and ``[N, 2]``."""
@@ -180,18 +184,38 @@ class Arena:
 
     def heading_error(self, position: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor]:
         """Vector to the current way-point ``[N, 2]`` [m] and angles to it and the next one ``[N, 2]`` [rad]."""
-        goals = torch.stack(self.progress.goals(), 1) - position[:, None]  # [N, 2 goals, 2]
-        return goals[:, 0], rotations.wrap_angle(torch.atan2(goals[..., 1], goals[..., 0]) - yaw[:, None])
+        goals = torch.stack(self.progress.goals(), 1)  # [N, 2 goals, 2]
+        return goals[:, 0] - position, self._bearings(goals, position, yaw)
+
+    def _bearings(self, goals: Tensor, position: Tensor, yaw: Tensor) -> Tensor:
+        x, y = (goals - position[:, None]).unbind(-1)
+        return rotations.wrap_angle(torch.atan2(y, x) - yaw[:, None])
+
+    def expected_goals(self) -> Tensor:
+        """Way-points in the world as robots that misjudge their place expect them, ``[N, 2 goals, 2]``."""
+        if self.misjudgement is None:
+            return torch.stack(self.progress.goals(), 1)
+        current, following = self.progress.goals(self.misjudgement.unknown)
+        coming = self.progress.next_obstacle
+        shift = self.misjudgement.expected(self.layout.axis(coming))
+        return torch.stack((current, following + shift * (coming != self.progress.obstacle)[:, None]), 1)
+
+    def expected_type(self) -> Tensor:
+        """Type of the current obstacle as those robots take it, one-hot ``[N, 7]``; one of the course, if guessed."""
+        kinds = self.progress.obstacle
+        if self.misjudgement is not None:
+            guessed = (self.misjudgement.guess * len(self.types)).long()
+            kinds = torch.where(self.misjudgement.unknown > 0.5, guessed, kinds)
+        return self.types[kinds].float()
 
     def place(self, position: Tensor, yaw: Tensor) -> Tensor:
         """``keys.PLACE`` of robots at ``[N, 2]`` [m] with headings ``[N]`` [rad]: ``[N, 8]``."""
-        offset = torch.stack(self.progress.goals(), 1) - position[:, None]
+        offset = self.expected_goals() - position[:, None]
         forward = torch.stack((yaw.cos(), yaw.sin()), -1)[:, None]
         ahead = (offset * forward).sum(-1)
         left = offset[..., 1] * forward[..., 0] - offset[..., 0] * forward[..., 1]
         obstacle = self.progress.obstacle
-        turned = yaw - self.layout.axis(obstacle)
-        local = self.layout.local_to(obstacle, position)
+        local, turned = self._at(obstacle, position, yaw)
         way_points = torch.stack((ahead, left), -1).flatten(1)
         return torch.cat((way_points, local, turned.sin()[:, None], turned.cos()[:, None]), -1)
 
@@ -201,9 +225,9 @@ class Arena:
         believed = self.believed(simulator.root_position[:, :2], yaw)
         return TensorDict(
             {
-                keys.HEADING_ERROR: self.heading_error(*believed)[1],
+                keys.HEADING_ERROR: self._bearings(self.expected_goals(), *believed),
                 keys.PLACE: self.place(*believed),
-                keys.OBSTACLE: self.types[self.progress.obstacle].float(),
+                keys.OBSTACLE: self.expected_type(),
                 keys.PROGRESS: torch.nn.functional.one_hot(self.progress.stage, self.progress.num_stages).float(),
                 keys.SCANDOTS: self.scan.scandots(simulator.root_position, yaw, parameter),
             },

@@ -10,32 +10,45 @@ from torch import Tensor
 
 from agility_rl import rotations
 
-NEARBY = (0.05, 0.05, 0.03)
-"""Deviations of an obstacle that is close: ahead, aside [m], yaw [rad]; near one, an image says where the robot stands
-to 0.04 m (median; docs/student.md)."""
-A_METRE = (0.04, 0.04, 0.02)
-"""What each metre to the obstacle's middle adds; at 2 m images err by 0.13 m (median), the yaw by 0.06 rad."""
-LASTING = 1.0
-"""Time in which an error falls to 1/e [s]: images in a row err alike, and what has been counted wrong stays so."""
+SEEN = (0.04, 0.03, 0.015)
+"""Deviations of an obstacle that has been in view: ahead, aside [m], yaw [rad] (docs/student.md)."""
+LASTING = 0.6
+"""Time in which such an error falls to 1/e [s]: images in a row err alike, and what has been counted wrong stays so."""
+UNSEEN = (0.14, 0.12, 0.05)
+"""Deviations of one that has not: how far it stands from where the course has it, along and across it, and turned."""
+VIEW_DISTANCE, VIEW_ANGLE = 2.5, 0.6
+"""Nearer than this [m], and by less than this [rad] beside where the robot looks, an obstacle is in view."""
+RECOGNITION = 0.15
+"""Time in view in which what was unknown of an obstacle falls to 1/e [s]."""
+_ERRORS = ("seen", "unseen", "upcoming")
 
 
 class Misjudgement:
-    r"""Errors of the place of ``N`` robots: they see their obstacle where it is not, and turned as it is not.
+    r"""Errors of the place of ``N`` robots: they think their obstacle is where it is not, and turned as it is not.
 
-    .. math:: z_{t + 1} = a z_t + \sqrt{1 - a^2}\, \xi, \quad a = e^{-\Delta t / 1\,\mathrm{s}}, \quad
-              \hat o = o + m\,(\sigma_0 + \sigma_1 |o|) \odot z
+    .. math:: \hat p &= R(c\, u_\psi)\,(p + c\, u_{xy}), \quad \hat\psi = \psi + c\, u_\psi, \qquad
+              \hat o' = \hat o + e_{xy}, \quad \hat\psi' = \hat\psi + e_\psi \\
+              c_{t + 1} &= \begin{cases} e^{-\Delta t / 0.15\,\mathrm{s}}\, c_t & \text{in view} \\
+              c_t & \text{else} \end{cases}, \qquad
+              e_{t + 1} = a\, e_t + \sqrt{1 - a^2}\, \sigma \odot \xi, \quad a = e^{-\Delta t / 0.6\,\mathrm{s}}
 
-    o is where the obstacle ahead is seen, in the robot's frame, with the robot's yaw at it. All else that is said of
-    the place follows from there.
+    p and :math:`\psi` are the robot's place and yaw in its obstacle's frame, o is where it sees the obstacle. Until it
+    has been in view, the obstacle stands for the robot where the course has it, u away from where it does, and is of a
+    type that is guessed; afterwards it is seen e beside where it is. All sizes are multiplied by the factor. All else
+    that is said of the place follows from there. The obstacle after it is unseen, too.
 
-    Source: ours; the sizes are those of our first student that passes whole courses. A teacher that learns with them
-    chooses what is good for whoever knows his place no better.
+    Source: ours; the sizes are those of a student that matches shapes (docs/student.md). A teacher that learns with
+    them chooses what is good for whoever knows his place no better, and no earlier.
 
     Args:
         num_robots: N.
         generator: source of randomness; where it is, the tensors are.
-        factor: m, on all sizes.
+        factor: on all sizes.
         period: of a decision [s].
+
+    Attributes:
+        unknown: ``[N]``, c: how much of what is known of an obstacle in view is unknown of this one, from 1 to 0.
+        guess: ``[N]`` in [0, 1), for a type that is guessed.
 
     Raises:
         ValueError: if the factor is not from 0 to 10.
@@ -51,25 +64,53 @@ class Misjudgement:
     def __init__(self, num_robots: int, generator: torch.Generator, factor: float, period: float) -> None:
         if not 0.0 <= factor <= 10.0:
             raise ValueError(f"misjudgement must be a factor from 0 to 10, got {factor}")
-        self.generator, self.kept, device = generator, math.exp(-period / LASTING), generator.device
-        self.error = torch.zeros(num_robots, 3, device=device)
-        self._nearby, self._a_metre = (factor * torch.tensor(sizes, device=device) for sizes in (NEARBY, A_METRE))
+        self.generator, device = generator, generator.device
+        self._kept, self._forgotten = math.exp(-period / LASTING), math.exp(-period / RECOGNITION)
+        self._sizes = factor * torch.tensor([SEEN, UNSEEN], device=device)
+        self.seen, self.unseen, self.upcoming = torch.zeros(3, num_robots, 3, device=device)
+        self.unknown, self.guess = torch.ones(num_robots, device=device), torch.zeros(num_robots, device=device)
 
-    def _drawn(self) -> Tensor:
-        return torch.randn(self.error.shape, generator=self.generator, device=self.error.device)
+    def _drawn(self, errors: int) -> Tensor:
+        return torch.randn(errors, *self.seen.shape, generator=self.generator, device=self.seen.device)
+
+    def _guess(self, changed: Tensor) -> None:
+        """Know nothing of the obstacles of the rows of a bool mask ``[N]``."""
+        guess = torch.rand(self.guess.shape, generator=self.generator, device=self.guess.device)
+        self.guess, self.unknown = torch.where(changed, guess, self.guess), self.unknown.masked_fill(changed, 1.0)
 
     def begin(self, mask: Tensor) -> None:
         """Draw the errors of the rows of a bool mask ``[N]`` anew."""
-        self.error = torch.where(mask[:, None], self._drawn(), self.error)
+        for name, drawn in zip(_ERRORS, self._drawn(3), strict=True):
+            setattr(self, name, torch.where(mask[:, None], drawn, getattr(self, name)))
+        self._guess(mask)
 
-    def advance(self) -> None:
-        """One decision later."""
-        self.error = self.kept * self.error + math.sqrt(1.0 - self.kept**2) * self._drawn()
+    def advance(self, changed: Tensor, local: Tensor, turned: Tensor) -> None:
+        """One decision later.
+
+        Args:
+            changed: bool ``[N]``, whose obstacle is another than before.
+            local: where robots stand, ``[N, 2]`` in its frame [m].
+            turned: by how much they are turned there, ``[N]`` [rad].
+        """
+        seen, upcoming = self._drawn(2)
+        self.seen = self._kept * self.seen + math.sqrt(1.0 - self._kept**2) * seen
+        ahead, aside = rotations.turn(-local, -turned).unbind(-1)
+        near = torch.linalg.vector_norm(local, dim=-1) < VIEW_DISTANCE
+        in_view = near & (torch.atan2(aside, ahead).abs() < VIEW_ANGLE)
+        self.unknown = torch.where(in_view, self._forgotten * self.unknown, self.unknown)
+        self._guess(changed)
+        self.unseen = torch.where(changed[:, None], self.upcoming, self.unseen)
+        self.upcoming = torch.where(changed[:, None], upcoming, self.upcoming)
+
+    def expected(self, axis: Tensor) -> Tensor:
+        """How far the next obstacle, of an axis ``[N]`` [rad], is thought to be from where it is, ``[N, 2]`` [m]."""
+        return -rotations.turn((self._sizes[1] * self.upcoming)[:, :2], axis)
 
     def misjudged(self, local: Tensor, turned: Tensor) -> tuple[Tensor, Tensor]:
         """Where robots at ``[N, 2]`` [m] in their obstacle's frame, turned by ``[N]`` [rad] there, think they are."""
-        distance = torch.linalg.vector_norm(local, dim=-1, keepdim=True)
-        ahead, aside, yaw = ((self._nearby + self._a_metre * distance) * self.error).unbind(-1)
+        along, across, turn = (self._sizes[1] * self.unknown[:, None] * self.unseen).unbind(-1)
+        local, turned = rotations.turn(local + torch.stack((along, across), -1), turn), turned + turn
+        ahead, aside, yaw = (self._sizes[0] * self.seen).unbind(-1)
         believed = turned + yaw
         # The obstacle is seen at -R(turned)^T local, and thought to be there and a bit beside.
         seen = torch.stack((ahead, aside), -1) - rotations.turn(local, -turned)
@@ -77,8 +118,9 @@ class Misjudgement:
 
     def state_dict(self) -> dict[str, Any]:
         """The errors."""
-        return {"error": self.error.clone()}
+        return {name: getattr(self, name).clone() for name in (*_ERRORS, "unknown", "guess")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self.error = state["error"].clone()
+        for name, value in state.items():
+            setattr(self, name, value.clone())

@@ -62,6 +62,7 @@ class CourseProgress:
         self._longest = longest = layout.course.most_way_points
         filled = [(*points, *(points[-1],) * (longest - len(points))) for points in goals]
         self._points = torch.tensor(filled, device=device)
+        self._usual = self._points.mean(0)
         self._count = torch.tensor([len(points) for points in goals], device=device)
         self._passage = torch.tensor([kind.passage for kind in layout.kinds], device=device)
         self._beyond = torch.tensor([0.0, _BEYOND], device=device)
@@ -90,6 +91,11 @@ class CourseProgress:
         return self._obstacle(self.leg)
 
     @property
+    def next_obstacle(self) -> Tensor:
+        """Index of the obstacle of the way-point after the current one, int64 ``[N]``."""
+        return self._obstacle(self._after()[0])
+
+    @property
     def stage(self) -> Tensor:
         """Index of the current way-point among those of all obstacles of all routes, int64 ``[N]``."""
         return (self.layout.first_leg + self.leg) * self._longest + self.point
@@ -114,12 +120,21 @@ class CourseProgress:
         """Current way-point in the world, ``[N, 2]`` [m]."""
         return self.layout.world(self.obstacle, self.local_goal())
 
-    def goals(self) -> tuple[Tensor, Tensor]:
-        """Current and next way-point in the world, each ``[N, 2]`` [m]."""
-        current = self.goal()
+    def goals(self, unknown: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Current and next way-point in the world, each ``[N, 2]`` [m].
+
+        Args:
+            unknown: of the current obstacle's type, ``[N]`` from 0 to 1. As far as it is, and for the next obstacle,
+                way-points are then where those of all obstacles of the course are on average.
+        """
         leg, point = self._after()
         coming = self._obstacle(leg)
-        following = self.layout.world(coming, self._points[coming, point])
+        now, after = self.local_goal(), self._points[coming, point]
+        if unknown is not None:
+            elsewhere = torch.where(coming == self.obstacle, unknown, 1.0)
+            now = now.lerp(self._usual[self.point], unknown[:, None])
+            after = after.lerp(self._usual[point], elsewhere[:, None])
+        current, following = self.layout.world(self.obstacle, now), self.layout.world(coming, after)
         beyond = current + self._beyond
         return current, torch.where((leg >= self.end)[:, None], beyond, following)
 

@@ -11,7 +11,7 @@ import torch
 from agility_rl import keys, rotations
 from agility_rl.envs.arena import Arena
 from agility_rl.envs.course_presets import COURSES
-from agility_rl.envs.misjudgement import Misjudgement
+from agility_rl.envs.misjudgement import UNSEEN, Misjudgement
 from agility_rl.simulation import BatchSimulator
 
 N = 60
@@ -204,14 +204,37 @@ def test_robots_that_misjudge_their_place_are_told_one_story() -> None:
     assert not torch.allclose(place, arena.place(position, yaw), atol=0.05)
     bearing = torch.atan2(place[:, [1, 3]], place[:, [0, 2]])
     torch.testing.assert_close(bearing, seen[keys.HEADING_ERROR], atol=1e-4, rtol=0)
-    # Way-points are as far from each other as they are, and the present one lies where it does at the obstacle.
-    goals = torch.stack(arena.progress.goals(), 1)
+    # Way-points are as far from each other as they are expected, and the present one from the obstacle, too.
+    goals = arena.expected_goals()
     apart = torch.linalg.vector_norm(goals[:, 0] - goals[:, 1], dim=-1)
     torch.testing.assert_close(torch.linalg.vector_norm(place[:, :2] - place[:, 2:4], dim=-1), apart)
-    away = torch.linalg.vector_norm(arena.progress.local_goal() - place[:, 4:6], dim=-1)
+    at_obstacle = arena.layout.local_to(arena.progress.obstacle, goals[:, 0])
+    away = torch.linalg.vector_norm(at_obstacle - place[:, 4:6], dim=-1)
     torch.testing.assert_close(torch.linalg.vector_norm(place[:, :2], dim=-1), away, atol=1e-5, rtol=0)
     state = arena.state_dict()
-    arena.advance()
+    arena.advance(arena.progress.leg, position, yaw)
     assert not torch.equal(arena.observe(simulator, yaw)[keys.PLACE], place)
     arena.load_state_dict(state)
     assert torch.equal(arena.observe(simulator, yaw)[keys.PLACE], place)
+
+
+def test_way_points_and_types_of_obstacles_that_nobody_has_seen_are_guessed() -> None:
+    errors = Misjudgement(200, torch.Generator(), 1.0, 0.04)
+    arena, simulator = build(n=200, misjudgement=errors)
+    begin(arena, simulator)
+    rows, obstacle = torch.arange(200), arena.progress.obstacle
+    usual = torch.tensor([slot.goals for slot in COURSES["full"].slots]).mean(0)
+    for unknown in (1.0, 0.25, 0.0):
+        errors.unknown.fill_(unknown)
+        own = arena.layout.local_to(obstacle, arena.expected_goals()[:, 0])
+        torch.testing.assert_close(own, arena.progress.local_goal().lerp(usual[0].expand(200, 2), unknown))
+        right = (arena.expected_type().argmax(-1) == arena.types[obstacle].float().argmax(-1)).float().mean()
+        assert (0.05 < right < 0.3) if unknown == 1.0 else (right == 1.0)
+    arena.progress.point.fill_(3)  # the last one of every obstacle
+    goals, coming = torch.stack(arena.progress.goals(), 1), arena.progress.next_obstacle
+    further = arena.progress.leg + 1 < arena.progress.end
+    expected = arena.expected_goals()
+    assert torch.equal(expected[:, 0], goals[:, 0]) and torch.equal(expected[~further], goals[~further])
+    shift = arena.layout.local_to(coming, expected[:, 1])[further] - usual[0]
+    wanted = -errors.upcoming[rows[further], :2] * torch.tensor(UNSEEN[:2])
+    torch.testing.assert_close(shift, wanted, atol=1e-5, rtol=0)

@@ -135,6 +135,8 @@ def test_a_student_is_evaluated_under_disturbance(
     assert names == {"course_bar_jump.png", "course_bar_jump_noise.png", "course_behaviours.png"}
     with pytest.raises(ValueError, match="teacher has no camera to disturb; give a student"):
         recipe.evaluate(recipe.Config(untrained_teacher, disturbance=("noise",), **options), console)
+    with pytest.raises(ValueError, match=r"--misjudgement: .* misjudges its place by itself; give a teacher"):
+        recipe.evaluate(recipe.Config(run, misjudgement=1.0, **options), console)
     wrong = make_student("wrong", camera=describe_camera() | {"depth_range": [0.3, 2.0]})
     with pytest.raises(ValueError, match=r"images of depth_range \[0.3, 2.0\], this code's camera has \[0.3, 4.0\]"):
         recipe.evaluate(recipe.Config(wrong, **options), console)

@@ -250,6 +250,17 @@ def test_way_points_follow_the_route(rollouts: ModuleType) -> None:
         torch.testing.assert_close(goals[4 * place + 1], layout.world(torch.tensor([index]), local)[0])
 
 
+def test_a_teacher_that_misjudges_its_place_goes_elsewhere(
+    recipe: ModuleType, deciders: ModuleType, config: Any
+) -> None:
+    decider = deciders.load_decider(config.run, config.bbc)
+    ends = []
+    for factor in (0.0, 0.0, 1.0):
+        episodes = recipe.simulate(COURSES["tunnel"], decider, replace(config, misjudgement=factor))
+        ends.append(torch.stack([one.steps["position"][-1] for one in episodes]))
+    assert torch.equal(ends[0], ends[1]) and not torch.equal(ends[0], ends[2])
+
+
 def test_groups_of_courses(deciders: ModuleType, recipe: ModuleType, untrained: Path) -> None:
     decider = deciders.load_script("trot:1.0", untrained)
     config = recipe.Config(script="trot:1.0", course=("tunnel", "each", "tunnel"))
