@@ -65,7 +65,7 @@ class Misjudgement:
         if not 0.0 <= factor <= 10.0:
             raise ValueError(f"misjudgement must be a factor from 0 to 10, got {factor}")
         self.generator, device = generator, generator.device
-        self._kept, self._forgotten = math.exp(-period / LASTING), math.exp(-period / RECOGNITION)
+        self.kept, self._forgotten = math.exp(-period / LASTING), math.exp(-period / RECOGNITION)
         self._sizes = factor * torch.tensor([SEEN, UNSEEN], device=device)
         self.seen, self.unseen, self.upcoming = torch.zeros(3, num_robots, 3, device=device)
         self.unknown, self.guess = torch.ones(num_robots, device=device), torch.zeros(num_robots, device=device)
@@ -93,7 +93,7 @@ class Misjudgement:
             turned: by how much they are turned there, ``[N]`` [rad].
         """
         seen, upcoming = self._drawn(2)
-        self.seen = self._kept * self.seen + math.sqrt(1.0 - self._kept**2) * seen
+        self.seen = self.kept * self.seen + math.sqrt(1.0 - self.kept**2) * seen
         ahead, aside = rotations.turn(-local, -turned).unbind(-1)
         near = torch.linalg.vector_norm(local, dim=-1) < VIEW_DISTANCE
         in_view = near & (torch.atan2(aside, ahead).abs() < VIEW_ANGLE)

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 
 from agility_rl.behaviours import command_bounds, commands_from_parameters
 from agility_rl.deploy.artifact import Artifact, ArtifactError
+from agility_rl.envs.misjudgement import LASTING
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.modules import Teacher
 from agility_rl.record.mcap_logger import read_scalars
@@ -167,7 +168,7 @@ def test_options_of_the_course_reach_it(recipe: ModuleType, smoke: Any) -> None:
     assert parts.env.arena.progress.radius == 0.45
     assert (parts.env.arena.start_spread, parts.env.arena.start_after) == (2.0, 0.5)
     errors = parts.env.arena.misjudgement
-    assert errors is not None and errors.kept == math.exp(-0.02 * env.decision_steps)
+    assert errors is not None and errors.kept == math.exp(-0.02 * env.decision_steps / LASTING)
     assert parts.learner.update.loss.bounds_coeff == 0.25 and "loss_bounds" in parts.learner.update.loss.out_keys
     assert parts.env.termination_reward == -500.0 and parts.env.rewards["heading"].weight == 0.25
     parts.env.close()
