@@ -208,9 +208,9 @@ class Arena:
             kinds = torch.where(self.misjudgement.unknown > 0.5, guessed, kinds)
         return self.types[kinds].float()
 
-    def place(self, position: Tensor, yaw: Tensor) -> Tensor:
-        """``keys.PLACE`` of robots at ``[N, 2]`` [m] with headings ``[N]`` [rad]: ``[N, 8]``."""
-        offset = self.expected_goals() - position[:, None]
+    def place(self, goals: Tensor, position: Tensor, yaw: Tensor) -> Tensor:
+        """``keys.PLACE`` ``[N, 8]`` of robots at ``[N, 2]`` [m], yaws ``[N]`` [rad] and way-points ``[N, 2, 2]`` [m]."""
+        offset = goals - position[:, None]
         forward = torch.stack((yaw.cos(), yaw.sin()), -1)[:, None]
         ahead = (offset * forward).sum(-1)
         left = offset[..., 1] * forward[..., 0] - offset[..., 0] * forward[..., 1]
@@ -222,11 +222,11 @@ class Arena:
     def observe(self, simulator: Simulator, yaw: Tensor) -> TensorDict:
         """What the Task-Specific Controller sees of the course, ``[N]``."""
         parameter = self.layout.parameter(simulator.hinge_angle)
-        believed = self.believed(simulator.root_position[:, :2], yaw)
+        told = self.expected_goals(), *self.believed(simulator.root_position[:, :2], yaw)
         return TensorDict(
             {
-                keys.HEADING_ERROR: self._bearings(self.expected_goals(), *believed),
-                keys.PLACE: self.place(*believed),
+                keys.HEADING_ERROR: self._bearings(*told),
+                keys.PLACE: self.place(*told),
                 keys.OBSTACLE: self.expected_type(),
                 keys.PROGRESS: torch.nn.functional.one_hot(self.progress.stage, self.progress.num_stages).float(),
                 keys.SCANDOTS: self.scan.scandots(simulator.root_position, yaw, parameter),

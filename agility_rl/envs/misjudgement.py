@@ -15,7 +15,8 @@ SEEN = (0.04, 0.03, 0.015)
 LASTING = 0.6
 """Time in which such an error falls to 1/e [s]: images in a row err alike, and what has been counted wrong stays so."""
 UNSEEN = (0.14, 0.12, 0.05)
-"""Deviations of one that has not: how far it stands from where the course has it, along and across it, and turned."""
+"""Deviations of one that has not: how far it stands from where the course has it, along, across [m], and turned [rad]
+(docs/student.md)."""
 VIEW_DISTANCE, VIEW_ANGLE = 2.5, 0.6
 """Nearer than this [m], and by less than this [rad] beside where the robot looks, an obstacle is in view."""
 RECOGNITION = 0.15
@@ -47,6 +48,9 @@ class Misjudgement:
         period: of a decision [s].
 
     Attributes:
+        seen: ``[N, 3]``, e in units of its deviations.
+        unseen: ``[N, 3]``, u in units of its deviations.
+        upcoming: ``[N, 3]``, that of the obstacle after this one.
         unknown: ``[N]``, c: how much of what is known of an obstacle in view is unknown of this one, from 1 to 0.
         guess: ``[N]`` in [0, 1), for a type that is guessed.
 
@@ -103,7 +107,10 @@ class Misjudgement:
         self.upcoming = torch.where(changed[:, None], upcoming, self.upcoming)
 
     def expected(self, axis: Tensor) -> Tensor:
-        """How far the next obstacle, of an axis ``[N]`` [rad], is thought to be from where it is, ``[N, 2]`` [m]."""
+        """How far the next obstacle, of an axis ``[N]`` [rad], is thought to be from where it is, ``[N, 2]`` [m].
+
+        By how much it is thought to be turned counts only when it is the present one.
+        """
         return -rotations.turn((self._sizes[1] * self.upcoming)[:, :2], axis)
 
     def misjudged(self, local: Tensor, turned: Tensor) -> tuple[Tensor, Tensor]:
@@ -121,6 +128,16 @@ class Misjudgement:
         return {name: getattr(self, name).clone() for name in (*_ERRORS, "unknown", "guess")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
+        """Restore what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if it is that of other errors.
+        """
+        own = self.state_dict().keys()
+        if state.keys() != own:
+            raise ValueError(
+                f"expected the errors {', '.join(own)} of a misjudged place, got {', '.join(state)}; the run began "
+                "with another kind of errors and cannot be resumed: begin another one with --init-from"
+            )
         for name, value in state.items():
             setattr(self, name, value.clone())

@@ -155,9 +155,9 @@ def test_place_by_hand() -> None:
     begin(arena, simulator)
     layout = arena.layout
     layout.position, layout.yaw = torch.tensor([[[2.0, 3.5]]]), torch.tensor([[math.pi / 2]])
-    place = arena.place(torch.tensor([[1.0, 1.475]]), torch.tensor([0.0]))
+    place = arena.place(arena.expected_goals(), torch.tensor([[1.0, 1.475]]), torch.tensor([0.0]))
     torch.testing.assert_close(place, torch.tensor([[1.0, 0.0, 1.0, 0.5, -2.025, 1.0, -1.0, 0.0]]), atol=1e-6, rtol=0)
-    turned = arena.place(torch.tensor([[1.0, 1.475]]), torch.tensor([math.pi / 2]))
+    turned = arena.place(arena.expected_goals(), torch.tensor([[1.0, 1.475]]), torch.tensor([math.pi / 2]))
     torch.testing.assert_close(turned, torch.tensor([[0.0, -1.0, 0.5, -1.0, -2.025, 1.0, 0.0, 1.0]]), atol=1e-6, rtol=0)
 
 
@@ -201,7 +201,7 @@ def test_robots_that_misjudge_their_place_are_told_one_story() -> None:
     position = simulator.root_position[:, :2]
     seen = arena.observe(simulator, yaw)
     place = seen[keys.PLACE]
-    assert not torch.allclose(place, arena.place(position, yaw), atol=0.05)
+    assert not torch.allclose(place, arena.place(arena.expected_goals(), position, yaw), atol=0.05)
     bearing = torch.atan2(place[:, [1, 3]], place[:, [0, 2]])
     torch.testing.assert_close(bearing, seen[keys.HEADING_ERROR], atol=1e-4, rtol=0)
     # Way-points are as far from each other as they are expected, and the present one from the obstacle, too.

@@ -109,18 +109,24 @@ def test_errors_of_what_is_seen_last_for_a_while_and_stay_as_large() -> None:
 
 def test_only_episodes_that_begin_draw_anew_and_a_saved_state_goes_on_alike() -> None:
     made = errors()
+    made.unknown.fill_(0.5)
     before, mask = made.state_dict(), torch.arange(N) < 10
     made.begin(mask)
     for name, then in before.items():
-        now = getattr(made, name)
-        if name != "unknown":
-            assert torch.equal((now != then).view(N, -1).any(-1), mask)
+        assert torch.equal((getattr(made, name) != then).view(N, -1).any(-1), mask)
     other = errors(period=0.04)
     other.load_state_dict(made.state_dict())
     other.generator.set_state(made.generator.get_state())
     for each in (made, other):
         each.advance(mask, torch.zeros(N, 2), torch.zeros(N))
     assert all(torch.equal(value, other.state_dict()[name]) for name, value in made.state_dict().items())
+
+
+def test_a_state_of_other_errors_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match="errors seen, unseen, upcoming, unknown, guess of a misjudged place, got error"
+    ):
+        errors().load_state_dict({"error": torch.zeros(N, 3)})
 
 
 def test_a_factor_out_of_range_is_refused() -> None:
