@@ -209,7 +209,7 @@ class Arena:
         return self.types[kinds].float()
 
     def place(self, goals: Tensor, position: Tensor, yaw: Tensor) -> Tensor:
-        """``keys.PLACE`` ``[N, 8]`` of robots at ``[N, 2]`` [m], yaws ``[N]`` [rad] and way-points ``[N, 2, 2]`` [m]."""
+        """``keys.PLACE`` ``[N, 8]`` of robots at ``[N, 2]`` [m], yaws ``[N]`` [rad], goals ``[N, 2, 2]`` [m]."""
         offset = goals - position[:, None]
         forward = torch.stack((yaw.cos(), yaw.sin()), -1)[:, None]
         ahead = (offset * forward).sum(-1)
