@@ -43,6 +43,8 @@ from rollouts import drive, load_controller
 
 SHOWN = (1, 2, 5, 10, 25, 50)
 POSE = torch.tensor(constants.DEFAULT_POSE)
+START = torch.tensor([0.0, 0.0, constants.STANDING_HEIGHT + CLEARANCE, 1.0, 0.0, 0.0, 0.0, *constants.DEFAULT_POSE])
+SUBSTEPS = round(constants.CONTROL_DT / constants.SIM_DT)
 
 
 def options_of(engine: str, args: argparse.Namespace) -> dict[str, Any]:
@@ -134,51 +136,55 @@ def contenders(args: argparse.Namespace) -> dict[str, Callable[[Tensor], None]]:
     """What is timed: bare engine, simulator and environment of each."""
     found: dict[str, Callable[[Tensor], None]] = {}
     for engine in ("batch", "warp"):
-        found[f"{engine}, bare"] = bare_step(engine, args)
+        found[f"{engine}, bare"] = (
+            bare_batch(args.robots, args.threads)
+            if engine == "batch"
+            else bare_warp(args.robots, simulator_device("warp", args.device))[0]
+        )
         found[f"{engine}, simulator"] = make_simulator(num_simulations=args.robots, **options_of(engine, args)).step
         env = LocomotionEnv(args.robots, simulator_options=options_of(engine, args))
         found[f"{engine}, env.step"] = env_step(env)
     return found
 
 
-def bare_step(engine: str, args: argparse.Namespace) -> Callable[[Tensor], None]:
-    """The engine alone: write the targets, step."""
-    model = build_spec(sim_dt=constants.SIM_DT).compile()
-    substeps = round(constants.CONTROL_DT / constants.SIM_DT)
-    start = [*model.qpos0[:2], constants.STANDING_HEIGHT + CLEARANCE, *model.qpos0[3:7], *constants.DEFAULT_POSE]
-    if engine == "batch":
-        batch = mujoco.batch.Batch(model, args.robots, args.threads)
-        batch.bind("qpos")[:] = start
-        control = batch.bind("ctrl")
+def bare_batch(robots: int, threads: int) -> Callable[[Tensor], None]:
+    """MuJoCo's batch alone: write the targets, step."""
+    batch = mujoco.batch.Batch(build_spec(sim_dt=constants.SIM_DT).compile(), robots, threads)
+    batch.bind("qpos")[:] = START.numpy()
+    control = batch.bind("ctrl")
 
-        def step_batch(target: Tensor) -> None:
-            control[:] = target.numpy()
-            batch.step(nstep=substeps)
+    def step(target: Tensor) -> None:
+        control[:] = target.numpy()
+        batch.step(nstep=SUBSTEPS)
 
-        return step_batch
-    device = simulator_device("warp", args.device)
+    return step
+
+
+def bare_warp(robots: int, device: torch.device) -> tuple[Callable[[Tensor], None], Tensor, Tensor]:
+    """Mujoco-warp alone, on a GPU as a CUDA graph; beside it positions and velocities of its robots."""
     with warp.ScopedDevice(warp.device_from_torch(device)):
+        model = build_spec(sim_dt=constants.SIM_DT).compile()
         there = mujoco_warp.put_model(model)
-        data = mujoco_warp.make_data(model, args.robots, nconmax=48, njmax=306)
-        warp.to_torch(data.qpos).copy_(torch.tensor(start).expand(args.robots, -1))
+        data = mujoco_warp.make_data(model, robots, nconmax=48, njmax=306)
+        position, velocity, command = (warp.to_torch(array) for array in (data.qpos, data.qvel, data.ctrl))
+        position.copy_(START.expand_as(position))
         mujoco_warp.step(there, data)  # compiles
         graph = None
         if device.type == "cuda":
             with warp.ScopedCapture() as capture:
                 mujoco_warp.step(there, data)
             graph = capture.graph
-    command = warp.to_torch(data.ctrl)
 
-    def step_warp(target: Tensor) -> None:
+    def step(target: Tensor) -> None:
         command.copy_(target)
         with warp.ScopedDevice(warp.device_from_torch(device)):
-            for _ in range(substeps):
+            for _ in range(SUBSTEPS):
                 if graph is None:
                     mujoco_warp.step(there, data)
                 else:
                     warp.capture_launch(graph)
 
-    return step_warp
+    return step, position, velocity
 
 
 def env_step(env: LocomotionEnv) -> Callable[[Tensor], None]:

@@ -1,8 +1,9 @@
 """How fast is a training of stage 1 on a GPU at several sizes, and where does it wait for the host?
 
-In turns: bare ``mujoco_warp.step`` captured as a graph, our simulator, ``LocomotionEnv.step``, a roll-out with policy
-and critic; then whole iterations; as a preset of ``recipes/bbc_pretrain.py`` trains, on synthetic gaits. At last every
-place of the package where steps and roll-outs wait for the GPU (``torch.cuda.set_sync_debug_mode``).
+In turns: bare ``mujoco_warp.step`` captured as a graph, from where the simulator's robots are, our simulator,
+``LocomotionEnv.step``, a roll-out with policy and critic; then whole iterations; as a preset of
+``recipes/bbc_pretrain.py`` trains, on synthetic gaits. At last every place of the package where steps and roll-outs
+wait for the GPU (``torch.cuda.set_sync_debug_mode``).
 
     python benchmarks/gpu_rollout.py --robots 1024 4096 16384
 """
@@ -25,7 +26,7 @@ from types import ModuleType
 from typing import Any
 
 import torch
-from engines import bare_step
+from engines import bare_warp
 from plain_ppo import PHASES, load_recipe
 from tensordict import TensorDict
 from torch import Tensor
@@ -69,13 +70,16 @@ def waits() -> Iterator[Counter[str]]:
             torch.cuda.set_sync_debug_mode("default")
 
 
-def contenders(parts: Any, steps: int) -> dict[str, Callable[[], object]]:
-    """What is timed in turns; each takes so many control steps, the roll-out those of its preset."""
+def contenders(parts: Any, steps: int) -> tuple[dict[str, Callable[[], object]], Callable[[], None]]:
+    """What is timed in turns; each takes so many control steps, the roll-out those of its preset.
+
+    Beside them what comes before each turn: the bare engine's robots are put where the simulator's are.
+    """
     env, robots = parts.env, parts.env.num_robots
     pose = torch.tensor(constants.DEFAULT_POSE, device=env.device)
     scale = torch.tensor(constants.ACTION_SCALE, device=env.device)
     targets = pose + 0.05 * torch.randn(steps, robots, 12, generator=env.generator, device=env.device)
-    bare = bare_step("warp", argparse.Namespace(robots=robots, device=str(env.device)))
+    bare, position, velocity = bare_warp(robots, env.device)
     policy = parts.bbc.privileged_policy()
     env.reset()
 
@@ -85,21 +89,27 @@ def contenders(parts: Any, steps: int) -> dict[str, Callable[[], object]]:
     def step_env(target: Tensor) -> None:
         env.step(TensorDict({keys.ACTION: (target - pose) / scale}, [robots]))
 
+    def begin() -> None:
+        state = env.simulator
+        position.copy_(torch.cat((state.root_position, state.root_quaternion, state.joint_position), -1))
+        velocity.copy_(torch.cat((state.root_linear_velocity, state.root_angular_velocity, state.joint_velocity), -1))
+
     return {
         "bare": every(bare),
         "simulator": every(env.simulator.step),
         "env.step": every(step_env),
         "roll-out": lambda: parts.rollout.collect(policy),
-    }
+    }, begin
 
 
 def measure(recipe: ModuleType, cfg: Any, args: argparse.Namespace, look: bool) -> None:
     """Print the figures of one number of robots; ``look`` for waits too."""
     parts, robots, device = recipe.build(cfg), cfg.env.num_robots, torch.device(args.device)
-    turns = contenders(parts, args.steps)
+    turns, begin = contenders(parts, args.steps)
     found: dict[str, list[float]] = {name: [] for name in turns}
     for turn in range(args.rounds + 1):
         for name, work in turns.items():
+            begin()
             spent = seconds(work, device)
             if turn:  # the first turn warms up
                 found[name].append(spent)

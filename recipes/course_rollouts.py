@@ -100,7 +100,7 @@ def record_episodes(
     held = TensorDict({}, [n])
     tape = TensorDict({}, [n, env.max_steps])
     while bool((left > 0).any()):
-        kind = td[keys.OBSTACLE].argmax(-1)
+        kind = env.arena.types[env.arena.progress.obstacle].int().argmax(-1)
         fresh = age % decider.decision_steps == 0
         if bool(fresh.any()):
             seen = td[fresh] if senses is None else senses.observe(td[fresh], fresh)

@@ -246,7 +246,9 @@ class AgilityEnv(EnvBase):
         if self.depth is not None:
             self.depth.begin(mask)
 
-        return self._observe(self._outcome()).exclude("reward")
+        observation = self._observe(self._outcome()).exclude("reward")
+        # Transforms that add entries at a reset of all robots take the device from here.
+        return observation.to(self.device) if tensordict is None else observation
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         decision = tensordict[keys.ACTION]

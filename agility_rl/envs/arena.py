@@ -201,12 +201,9 @@ class Arena:
         return torch.stack((current, following + shift * (coming != self.progress.obstacle)[:, None]), 1)
 
     def expected_type(self) -> Tensor:
-        """Type of the current obstacle as those robots take it, one-hot ``[N, 7]``; one of the course, if guessed."""
-        kinds = self.progress.obstacle
-        if self.misjudgement is not None:
-            guessed = (self.misjudgement.guess * len(self.types)).long()
-            kinds = torch.where(self.misjudgement.unknown > 0.5, guessed, kinds)
-        return self.types[kinds].float()
+        """Type of the current obstacle, one-hot ``[N, 7]``; as far as it is unknown to those robots, of none."""
+        kinds = self.types[self.progress.obstacle].float()
+        return kinds if self.misjudgement is None else kinds * (1.0 - self.misjudgement.unknown[:, None])
 
     def place(self, goals: Tensor, position: Tensor, yaw: Tensor) -> Tensor:
         """``keys.PLACE`` ``[N, 8]`` of robots at ``[N, 2]`` [m], yaws ``[N]`` [rad], goals ``[N, 2, 2]`` [m]."""

@@ -218,7 +218,8 @@ class LocomotionEnv(EnvBase):
         observation[keys.REWARD_TERMS] = TensorDict(nothing, self.batch_size)
         for name in ("done", "terminated", "truncated"):
             observation[name] = torch.zeros(self.num_robots, 1, dtype=torch.bool, device=self.device)
-        return observation
+        # Transforms that add entries at a reset of all robots take the device from here.
+        return observation.to(self.device) if tensordict is None else observation
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict[keys.ACTION]

@@ -34,9 +34,10 @@ class Misjudgement:
               e_{t + 1} = a\, e_t + \sqrt{1 - a^2}\, \sigma \odot \xi, \quad a = e^{-\Delta t / 0.6\,\mathrm{s}}
 
     p and :math:`\psi` are the robot's place and yaw in its obstacle's frame, o is where it sees the obstacle. Until it
-    has been in view, the obstacle stands for the robot where the course has it, u away from where it does, and is of a
-    type that is guessed; afterwards it is seen e beside where it is. All sizes are multiplied by the factor. All else
-    that is said of the place follows from there. The obstacle after it is unseen, too.
+    has been in view, the obstacle stands for the robot where the course has it, u away from where it does, and is of
+    no type, which also tells the robot that it has not seen it; afterwards it is seen e beside where it is. All sizes
+    are multiplied by the factor. All else that is said of the place follows from there. The obstacle after it is
+    unseen, too.
 
     Source: ours; the sizes are those of a student that matches shapes (docs/student.md). A teacher that learns with
     them chooses what is good for whoever knows his place no better, and no earlier.
@@ -52,7 +53,6 @@ class Misjudgement:
         unseen: ``[N, 3]``, u in units of its deviations.
         upcoming: ``[N, 3]``, that of the obstacle after this one.
         unknown: ``[N]``, c: how much of what is known of an obstacle in view is unknown of this one, from 1 to 0.
-        guess: ``[N]`` in [0, 1), for a type that is guessed.
 
     Raises:
         ValueError: if the factor is not from 0 to 10.
@@ -72,21 +72,16 @@ class Misjudgement:
         self.kept, self._forgotten = math.exp(-period / LASTING), math.exp(-period / RECOGNITION)
         self._sizes = factor * torch.tensor([SEEN, UNSEEN], device=device)
         self.seen, self.unseen, self.upcoming = torch.zeros(3, num_robots, 3, device=device)
-        self.unknown, self.guess = torch.ones(num_robots, device=device), torch.zeros(num_robots, device=device)
+        self.unknown = torch.ones(num_robots, device=device)
 
     def _drawn(self, errors: int) -> Tensor:
         return torch.randn(errors, *self.seen.shape, generator=self.generator, device=self.seen.device)
-
-    def _guess(self, changed: Tensor) -> None:
-        """Know nothing of the obstacles of the rows of a bool mask ``[N]``."""
-        guess = torch.rand(self.guess.shape, generator=self.generator, device=self.guess.device)
-        self.guess, self.unknown = torch.where(changed, guess, self.guess), self.unknown.masked_fill(changed, 1.0)
 
     def begin(self, mask: Tensor) -> None:
         """Draw the errors of the rows of a bool mask ``[N]`` anew."""
         for name, drawn in zip(_ERRORS, self._drawn(3), strict=True):
             setattr(self, name, torch.where(mask[:, None], drawn, getattr(self, name)))
-        self._guess(mask)
+        self.unknown = self.unknown.masked_fill(mask, 1.0)
 
     def advance(self, changed: Tensor, local: Tensor, turned: Tensor) -> None:
         """One decision later.
@@ -101,8 +96,7 @@ class Misjudgement:
         ahead, aside = rotations.turn(-local, -turned).unbind(-1)
         near = torch.linalg.vector_norm(local, dim=-1) < VIEW_DISTANCE
         in_view = near & (torch.atan2(aside, ahead).abs() < VIEW_ANGLE)
-        self.unknown = torch.where(in_view, self._forgotten * self.unknown, self.unknown)
-        self._guess(changed)
+        self.unknown = torch.where(in_view, self._forgotten * self.unknown, self.unknown).masked_fill(changed, 1.0)
         self.unseen = torch.where(changed[:, None], self.upcoming, self.unseen)
         self.upcoming = torch.where(changed[:, None], upcoming, self.upcoming)
 
@@ -125,7 +119,7 @@ class Misjudgement:
 
     def state_dict(self) -> dict[str, Any]:
         """The errors."""
-        return {name: getattr(self, name).clone() for name in (*_ERRORS, "unknown", "guess")}
+        return {name: getattr(self, name).clone() for name in (*_ERRORS, "unknown")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned.

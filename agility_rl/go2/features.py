@@ -200,8 +200,11 @@ def explicit(root_height: Tensor, linear_velocity: Tensor) -> Tensor:
 
 def in_heading_frame(roll: Tensor, pitch: Tensor, feet: Tensor) -> Tensor:
     """Feet ``[*B, 4, 3]`` [m] of the base frame, turned upright but not by the yaw."""
-    level = rotations.from_euler(roll, pitch, torch.zeros_like(roll))
-    return rotations.rotate(level[..., None, :], feet)
+    angles = torch.stack((roll, pitch))[..., None]
+    (cr, cp), (sr, sp) = angles.cos(), angles.sin()
+    x, y, z = feet.unbind(-1)
+    left, up = cr * y - sr * z, sr * y + cr * z
+    return torch.stack((cp * x + sp * up, left, cp * up - sp * x), -1)
 
 
 def motion_frame(

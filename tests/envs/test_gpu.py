@@ -44,7 +44,7 @@ def test_locomotion_lives_there() -> None:
 
 def test_a_course_with_cameras_lives_there() -> None:
     def stand(td: TensorDictBase) -> TensorDictBase:
-        return td.set("action", torch.zeros(*td.shape, 12, device=td.device))
+        return td.set("action", td["history"].new_zeros(*td.shape, 12))
 
     options = {"name": "warp", "device": DEVICE}
     env = AgilityEnv(16, stand, simulator_options=options, decision_steps=2, episode_length=0.2, depth={})

@@ -63,6 +63,11 @@ def test_specs(build: Build) -> None:
     check_env_specs(build(3, **EVERYTHING), break_when_any_done="both", seed=0)
 
 
+def test_a_reset_says_on_which_device_it_is(build: Build) -> None:
+    env = build(2)
+    assert env.reset().device == env.device
+
+
 def test_shapes_are_those_of_the_documentation(build: Build) -> None:
     rollout = build(2).rollout(3)
     shapes = {
