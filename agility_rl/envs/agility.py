@@ -32,6 +32,7 @@ from agility_rl.envs.robots import Pushes, Robots
 from agility_rl.envs.scandots import NUM_SCANDOTS
 from agility_rl.go2 import camera, features
 from agility_rl.simulation import Simulator, make_simulator
+from agility_rl.tensors import constant
 
 Controller = Callable[[TensorDictBase], TensorDictBase]
 """The frozen Basic Behaviour Controller: locomotion observations to joint targets under ``action``."""
@@ -285,11 +286,11 @@ class AgilityEnv(EnvBase):
     def _judge(self, outcome: DecisionOutcome, state: AgilityState, kind: Tensor, events: Events) -> None:
         causes = {name: failed(state) for name, failed in self.terminations.items()}
         failure = torch.stack(tuple(causes.values())).any(0)
-        terms = {
-            name: (term.weight * self.dt * term.function(state)).masked_fill(state.robot.unstable, 0.0)
-            for name, term in self.rewards.items()
-        }
-        reward = torch.stack(tuple(terms.values())).sum(0).clamp(min=0.0)
+        weights = constant(tuple(term.weight * self.dt for term in self.rewards.values()), self.device)
+        weighted = weights[:, None] * torch.stack([term.function(state) for term in self.rewards.values()])
+        weighted = weighted.masked_fill(state.robot.unstable, 0.0)
+        reward = weighted.sum(0).clamp(min=0.0)
+        terms = dict(zip(self.rewards, weighted, strict=True))
         terms[TERMINATION_TERM] = self.termination_reward * self.dt * failure
         outcome.add(
             terms,

@@ -24,7 +24,7 @@ from agility_rl.envs.state import LocomotionState
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, Termination
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator, make_simulator
-from agility_rl.tensors import rows_of
+from agility_rl.tensors import constant, rows_of
 
 EDGE = 1.0
 """How far beyond the square of the starts an episode on a height field goes on [m]; the field ends a metre further."""
@@ -234,7 +234,8 @@ class LocomotionEnv(EnvBase):
         if boxes is not None:
             feet = rotations.rotate(self.simulator.root_quaternion[:, None], state.feet)
             state.low_feet = boxes.low_feet(feet + self.simulator.root_position[:, None])
-        terms = torch.stack([term.weight * self.dt * term.function(state) for term in self.rewards.values()], -1)
+        weights = constant(tuple(term.weight * self.dt for term in self.rewards.values()), self.device)
+        terms = weights * torch.stack([term.function(state) for term in self.rewards.values()], -1)
         terms = terms.masked_fill(state.unstable[:, None], 0.0)
         reward = terms.sum(-1, keepdim=True).clamp(min=0.0)
         terminated = torch.stack([failed(state) for failed in self.terminations]).any(0)[:, None]
