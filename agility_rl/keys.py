@@ -85,7 +85,8 @@ PLACE = "place"
 x, y [m], sine and cosine of its yaw in the frame of the obstacle to pass."""
 
 OBSTACLE = "obstacle"
-"""float32 ``[*B, 7]``, one-hot type of the obstacle to pass; order of :data:`agility_rl.envs.obstacles.OBSTACLES`."""
+"""float32 ``[*B, 7]``, one-hot type of the obstacle to pass; order of :data:`agility_rl.envs.obstacles.OBSTACLES`. Who
+misjudges the place is told none of an obstacle that has not been in view."""
 
 PROGRESS = "progress"
 """float32 ``[*B, S]``, one-hot: which way-point is the present one, of those of each obstacle of each route of the
