@@ -15,8 +15,8 @@ SEEN = (0.04, 0.03, 0.015)
 LASTING = 0.6
 """Time in which such an error falls to 1/e [s]: images in a row err alike, and what has been counted wrong stays so."""
 UNSEEN = (0.14, 0.12, 0.05)
-"""Deviations of one that has not: how far it stands from where the course has it, along, across [m], and turned [rad]
-(docs/student.md)."""
+"""Deviations of one that has not: how far it stands from where the course has it, along, across [m], and turned [rad];
+about what docs/student.md measured, across a little less (0.14 there)."""
 VIEW_DISTANCE, VIEW_ANGLE = 2.5, 0.6
 """Nearer than this [m], and by less than this [rad] beside where the robot looks, an obstacle is in view."""
 RECOGNITION = 0.15
@@ -52,6 +52,7 @@ class Misjudgement:
         seen: ``[N, 3]``, e in units of its deviations.
         unseen: ``[N, 3]``, u in units of its deviations.
         upcoming: ``[N, 3]``, that of the obstacle after this one.
+        kept: a, the share of e that is left after a decision.
         unknown: ``[N]``, c: how much of what is known of an obstacle in view is unknown of this one, from 1 to 0.
 
     Raises:
