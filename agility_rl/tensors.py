@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 
-@functools.cache
+@functools.lru_cache(maxsize=1024)  # bounded, for weights that change from step to step come here too
 def constant(values: tuple[Any, ...], device: torch.device, dtype: torch.dtype = torch.float32) -> Tensor:
     """A tuple of numbers, nested or not, as a tensor.
 
