@@ -192,6 +192,8 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError(f"--disturbance: {decider.name} has no camera to disturb; give a student")
     if decider.student is not None and config.misjudgement:
         raise ValueError(f"--misjudgement: {decider.name} misjudges its place by itself; give a teacher")
+    if config.run is None and config.misjudgement:
+        raise ValueError(f"--misjudgement: {decider.name} knows nothing to do about an unseen obstacle; give a teacher")
     cells = [(name, key) for name in names(config, decider) for key in disturbances]
     courses = {name: course_of(name) for name, _ in cells}
     output = config.output or decider.run or Path("runs") / decider.name

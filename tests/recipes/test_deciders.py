@@ -137,6 +137,8 @@ def test_a_student_is_evaluated_under_disturbance(
         recipe.evaluate(recipe.Config(untrained_teacher, disturbance=("noise",), **options), console)
     with pytest.raises(ValueError, match=r"--misjudgement: .* misjudges its place by itself; give a teacher"):
         recipe.evaluate(recipe.Config(run, misjudgement=1.0, **options), console)
+    with pytest.raises(ValueError, match=r"--misjudgement: .* nothing to do about an unseen obstacle; give a teacher"):
+        recipe.evaluate(recipe.Config(script="trot:1.0", misjudgement=1.0, **options), console)
     wrong = make_student("wrong", camera=describe_camera() | {"depth_range": [0.3, 2.0]})
     with pytest.raises(ValueError, match=r"images of depth_range \[0.3, 2.0\], this code's camera has \[0.3, 4.0\]"):
         recipe.evaluate(recipe.Config(wrong, **options), console)
