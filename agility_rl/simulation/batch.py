@@ -16,6 +16,7 @@ from torch import Tensor
 from agility_rl.go2 import constants
 from agility_rl.go2.model import ROBOT_GROUP
 from agility_rl.simulation.depth_camera import DepthCamera
+from agility_rl.simulation.openmp import rest
 from agility_rl.simulation.parameters import SimulationParameters
 from agility_rl.simulation.scenery import Piece
 from agility_rl.simulation.terrain import HeightField
@@ -115,6 +116,7 @@ class BatchSimulator:
 
     def _advance(self, steps: int) -> list[int]:
         """Physics steps for all; the simulations in which the engine raised (they keep their state, the rest go on)."""
+        rest()
         try:
             self.batch.step(nstep=steps)
         except SimulationError as error:
@@ -168,6 +170,7 @@ class BatchSimulator:
         self._qpos[ids], self._qvel[ids] = state, speed
         self._ctrl[ids] = joint_position[mask].numpy()
         self._previous_target = torch.where(mask[:, None], joint_position, self._previous_target)
+        rest()
         self.batch.forward(ids)
         self._warned[ids] = self._warning_count()[ids]
         self.unstable = self.unstable & ~mask
@@ -187,6 +190,7 @@ class BatchSimulator:
         state, speed = self._qpos[ids], self._qvel[ids]
         state[:, self._hinges], speed[:, self._hinge_speeds] = hinge_angle[mask].numpy(), 0.0
         self._qpos[ids], self._qvel[ids] = state, speed
+        rest()
         self.batch.forward(ids)
         self._read()
 
@@ -228,9 +232,9 @@ class BatchSimulator:
         """Distance [m] to the nearest surface that is not the robot, ``[N, R]``; infinite when there is none."""
         groups = np.ones(6, dtype=np.uint8)
         groups[ROBOT_GROUP] = 0
-        distance, _ = self.batch.ray(
-            origin.double().numpy(), torch.nn.functional.normalize(direction.double(), dim=-1).numpy(), groups
-        )[:2]
+        towards = torch.nn.functional.normalize(direction.double(), dim=-1).numpy()
+        rest()
+        distance, _ = self.batch.ray(origin.double().numpy(), towards, groups)[:2]
         found = torch.from_numpy(np.array(distance, dtype=np.float32))
         return torch.where(found < 0, torch.inf, found)
 

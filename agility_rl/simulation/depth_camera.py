@@ -14,6 +14,7 @@ from mujoco.batch import Batch
 from torch import Tensor
 
 from agility_rl.go2 import camera
+from agility_rl.simulation.openmp import rest
 from agility_rl.tensors import rows_of
 
 CAMERA = "depth"
@@ -111,6 +112,7 @@ class DepthCamera:
             return torch.zeros(0, *shape)
         for own, source in self._poses:
             own[rows] = source[rows]
+        rest()
         # Sensors of the position stage belong to what this stage comes after.
         self._batch.forward(mask.numpy(), stage=mujoco.mjtStage.mjSTAGE_VEL)
         depth = torch.from_numpy(self._depth[rows].astype(np.float32)).unflatten(-1, shape)
