@@ -4,6 +4,8 @@ Bare ``mujoco.batch.Batch.step``, our simulator, the environment, and the enviro
 same model, robots, substeps, threads and targets, so that their ratio does not depend on what else the machine does.
 
     python benchmarks/env_step.py --robots 1024 --threads 2
+
+With ``--peer PYTHON`` mjbatch's engine, which that other environment has (``peer.py``), takes its turns too.
 """
 
 from __future__ import annotations
@@ -11,13 +13,18 @@ from __future__ import annotations
 import argparse
 import os
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import mujoco.batch
+import numpy as np
 import torch
+from peer import Peer
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -32,26 +39,41 @@ from agility_rl.motion.stride_patterns import stride_patterns
 from agility_rl.simulation import make_simulator
 
 SIM_DT, CONTROL_DT = 0.005, 0.02
+SUBSTEPS = round(CONTROL_DT / SIM_DT)
 
 
 def bare(robots: int, threads: int) -> Callable[[Tensor], None]:
     """The engine alone: write the targets, step."""
     model = build_spec(sim_dt=SIM_DT).compile()
     batch = mujoco.batch.Batch(model, robots, threads)
-    joints = [model.jnt_qposadr[model.joint(name).id] for name in constants.JOINT_NAMES]
-    position = batch.bind("qpos")
-    position[:] = model.qpos0
-    position[:, 2] = constants.STANDING_HEIGHT + 0.005
-    position[:, joints] = constants.DEFAULT_POSE
+    batch.bind("qpos")[:] = standing(model)
     batch.forward()
     control = batch.bind("ctrl")
-    substeps = round(CONTROL_DT / SIM_DT)
 
     def step(target: Tensor) -> None:
         control[:] = target.numpy()
-        batch.step(nstep=substeps)
+        batch.step(nstep=SUBSTEPS)
 
     return step
+
+
+def standing(model: mujoco.MjModel) -> np.ndarray:
+    """Where a robot begins."""
+    position = model.qpos0.copy()
+    position[2] = constants.STANDING_HEIGHT + 0.005
+    position[[model.jnt_qposadr[model.joint(name).id] for name in constants.JOINT_NAMES]] = constants.DEFAULT_POSE
+    return position
+
+
+def mjbatch(python: Path, targets: Tensor, threads: int, folder: Path) -> Peer:
+    """The engine of mjbatch, which has an earlier MuJoCo: a turn of it is all targets."""
+    spec = build_spec(sim_dt=SIM_DT)
+    model = spec.compile()
+    # Position is what an actuator takes there; MuJoCo 4 says so, and earlier ones do not know the word.
+    (folder / "model.xml").write_text(spec.to_xml().replace(' input="pos"', ""), encoding="utf-8")
+    np.save(folder / "start.npy", standing(model))
+    np.save(folder / "targets.npy", targets.numpy())
+    return Peer(python, Path(__file__).with_name("peer_mjbatch.py"), str(folder), str(threads), str(SUBSTEPS))
 
 
 def simulator(robots: int, threads: int) -> Callable[[Tensor], None]:
@@ -109,6 +131,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--rounds", type=int, default=10, help="turns that each contender gets")
     parser.add_argument("--steps", type=int, default=25, help="control steps a turn")
+    parser.add_argument("--peer", type=Path, help="Python of an environment with mjbatch")
     options = parser.parse_args()
     robots, threads = options.robots, options.threads
     disturbed = {"randomization": Randomization(), "observation_noise": 1.0, "push_interval": 8.0}
@@ -124,14 +147,27 @@ def main() -> None:
     # Robots that shift their weight about the default pose: all contenders keep four feet on the ground.
     offset = 0.05 * torch.randn(options.steps, robots, 12, generator=generator)
     targets = torch.tensor(constants.DEFAULT_POSE) + offset
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for turn in range(options.rounds + 1):
-        for name, step in contenders.items():
-            start = time.perf_counter()
-            for target in targets:
-                step(target)
-            if turn:  # the first turn warms up
-                seconds[name].append(time.perf_counter() - start)
+
+    def through(step: Callable[[Tensor], None]) -> float:
+        start = time.perf_counter()
+        for target in targets:
+            step(target)
+        return time.perf_counter() - start
+
+    turns: dict[str, Callable[[], float]] = {name: partial(through, step) for name, step in contenders.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        peer = None
+        if options.peer is not None:
+            peer = mjbatch(options.peer, targets, threads, Path(folder))
+            turns["mjbatch's Batch.step"] = peer.ask
+        seconds: dict[str, list[float]] = {name: [] for name in turns}
+        for index in range(options.rounds + 1):
+            for name, turn in turns.items():
+                took = turn()
+                if index:  # the first turn warms up
+                    seconds[name].append(took)
+        if peer is not None:
+            peer.close()
     print(f"{robots} robots, {threads} threads, {torch.get_num_threads()} torch threads, load {os.getloadavg()[0]:.1f}")
     reference = seconds["bare Batch.step"]
     for name, times in seconds.items():

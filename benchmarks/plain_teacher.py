@@ -29,7 +29,7 @@ from agility_rl.losses import functional
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 import tsc_teacher as recipe
-from tsc_setup import OBSERVED
+from tsc_ppo import OBSERVED
 
 BEHAVIOURS, PARAMETERS = 5, 6
 ACTED = (keys.PROPRIOCEPTION, keys.HEADING_ERROR, keys.OBSTACLE, keys.PLACE)

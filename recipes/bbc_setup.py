@@ -142,6 +142,7 @@ def build(cfg: Config) -> Components:
         entropy_coeff=ppo.entropy,
         critic_coeff=ppo.value,
         loss_critic_type="l2",
+        functional=False,
     )
     schedule = None
     if ppo.desired_kl is not None:

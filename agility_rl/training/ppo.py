@@ -15,6 +15,9 @@ from agility_rl.training import distributed
 from agility_rl.training.seeding import permutation
 
 Extra = Callable[[TensorDictBase], Tensor]
+MEASURED = 1024
+"""Samples on which a divergence is measured: a mean over so many states is sure to a few per cent, and the schedule
+asks whether it is twice or half of what is wanted."""
 
 
 class FirstGroup:
@@ -44,9 +47,9 @@ class PPOUpdate:
     """Descends a PPO loss over a collected batch.
 
     Advantages are normalised over the whole batch, or within each group of it. After each epoch the divergence between
-    the policy that collected and the present one, on the last minibatch, may change the learning rate. Of several
-    processes (:mod:`agility_rl.training.distributed`), each brings a batch: moments, gradients and divergence are those
-    of all.
+    the policy that collected and the present one, on 1024 samples of the last minibatch, may change the learning rate.
+    Of several processes (:mod:`agility_rl.training.distributed`), each brings a batch: moments, gradients and
+    divergence are those of all.
 
     Source: Schulman et al. 2017, arXiv:1707.06347; Table S1 (clip, learning rate); normalisation and adaptive rate:
     released code (method notes, section 3.7).
@@ -60,7 +63,7 @@ class PPOUpdate:
         keep: entries of the batch beside the loss's own that ``extra`` or ``divergence`` read.
         groups: an int64 entry ``[T, N]`` and the number of its values: advantages are normalised within each of them.
             Of tasks that earn differently, the ones that earn more would else be learned at the others' expense.
-        divergence: KL divergence [nat] of a minibatch, ``()``; ``None`` with a fixed learning rate.
+        divergence: mean KL divergence [nat] of samples, ``()``; ``None`` with a fixed learning rate.
         schedule: adapts the learning rate to that divergence.
         precision: ``torch.bfloat16`` runs the hidden layers of policy and critic in it, about twice as fast where the
             processor multiplies in it; weights, the outputs and all that follows stay float32.
@@ -151,7 +154,7 @@ class PPOUpdate:
             metrics = {name: value.detach() for name, value in result.items() if value.numel() == 1}
             if self.divergence is not None and not critic_only:
                 with torch.no_grad():
-                    metrics["kl"] = distributed.average(self.divergence(sample))
+                    metrics["kl"] = distributed.average(self.divergence(sample[:MEASURED]))
                 if self.schedule is not None:
                     self.schedule.step(metrics["kl"])
         metrics["learning_rate"] = torch.tensor(self.optimizer.param_groups[0]["lr"])

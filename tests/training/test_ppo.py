@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 
 from agility_rl.modules import Critic, GaussianActor
+from agility_rl.training import ppo
 from agility_rl.training.ppo import PPOUpdate
 
 
@@ -76,6 +77,26 @@ def test_the_divergence_moves_the_learning_rate() -> None:
     metrics = update(collect(actor, critic, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(2))
     assert metrics["learning_rate"].item() == pytest.approx(3e-3 / 1.5**4)
     assert metrics["kl"].item() == 1.0
+
+
+@pytest.mark.parametrize(("minibatches", "measured"), [(4, 32), (1, 100)])
+def test_the_divergence_is_measured_on_a_part_of_the_last_minibatch(
+    minibatches: int, measured: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ppo, "MEASURED", 100)
+    seen: list[torch.Tensor] = []
+
+    def divergence(sample: TensorDict) -> torch.Tensor:
+        seen.append(sample["observation"])
+        return torch.tensor(0.01)
+
+    actor, critic, update = build(epochs=2, minibatches=minibatches, divergence=divergence)
+    batch = collect(actor, critic, torch.Generator().manual_seed(1))
+    update(batch, torch.Generator().manual_seed(2))
+    assert [len(sample) for sample in seen] == [measured, measured]
+    assert not torch.equal(*seen)
+    rows = {tuple(row) for row in batch["observation"].flatten(0, 1).tolist()}
+    assert {tuple(row) for sample in seen for row in sample.tolist()} <= rows
 
 
 def test_an_extra_loss_is_added() -> None:
