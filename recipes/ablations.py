@@ -91,7 +91,8 @@ def train(variant: str, seed: int, config: Config) -> Path:
     run = config.runs / f"ablation_{variant}_{seed}"
     if (run / "evaluation.json").is_file():
         return run
-    arguments = ["--iterations", str(config.iterations)] if config.iterations is not None else []
+    arguments = ["--max-minutes", "None"]  # alike are iterations, however busy the machine is
+    arguments += ["--iterations", str(config.iterations)] if config.iterations is not None else []
     if any((run / "checkpoints").glob("*")):
         arguments += ["--resume", str(run)]
     else:
