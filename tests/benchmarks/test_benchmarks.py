@@ -67,6 +67,16 @@ def test_plain_loop_and_teacher_run_in_turns(repository: Path) -> None:
 
 
 @pytest.mark.slow
+def test_training_prints_every_stage_on_either_engine(repository: Path) -> None:
+    size = ("--preset=smoke", "--robots", "4", "8", "--steps=2", "--rounds=1")
+    output = run(repository, "benchmarks/training.py", *size)
+    assert output.count("an iteration, s: collect") == 2 and "nan" not in output
+    pytest.importorskip("mujoco_warp")
+    output = run(repository, "benchmarks/training.py", "--simulator=warp", "--device=cpu", *size)
+    assert output.count("an iteration, s: collect") == 2
+
+
+@pytest.mark.slow
 def test_growth_prints_costs_of_robots_courses_and_images(repository: Path) -> None:
     options = ("--robots", "2", "4", "--course-robots=2", "--threads=1", "--rounds=1")
     output = run(repository, "benchmarks/growth.py", *options)

@@ -1,11 +1,13 @@
-"""How fast is a training of stage 1 on a GPU at several sizes, and where does it wait for the host?
+"""How fast is a training of stage 1 at several sizes, on either engine, and where does it wait for a GPU?
 
-In turns: bare ``mujoco_warp.step`` captured as a graph, from where the simulator's robots are, our simulator,
-``LocomotionEnv.step``, a roll-out with policy and critic; then whole iterations; as a preset of
-``recipes/bbc_pretrain.py`` trains, on synthetic gaits. At last every place of the package where steps and roll-outs
-wait for the GPU (``torch.cuda.set_sync_debug_mode``).
+In turns: the bare engine (``Batch.step``, or ``mujoco_warp.step`` captured as a graph) from where the simulator's
+robots are, our simulator, ``LocomotionEnv.step``, a roll-out with policy and critic; then whole iterations, and on a
+CPU those of a plain PyTorch loop in float32 (``plain_ppo.py``); as a preset of ``recipes/bbc_pretrain.py`` trains, on
+synthetic gaits. On a GPU at last every place of the package where steps and roll-outs wait for it
+(``torch.cuda.set_sync_debug_mode``).
 
-    python benchmarks/gpu_rollout.py --robots 1024 4096 16384
+    python benchmarks/training.py --robots 256 1024 4096
+    python benchmarks/training.py --simulator warp --robots 1024 4096 16384
 """
 
 from __future__ import annotations
@@ -22,19 +24,24 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
 from types import ModuleType
 from typing import Any
 
 import torch
-from engines import bare_warp
-from plain_ppo import PHASES, load_recipe
+from mujoco.batch import Batch
+from plain_ppo import PHASES, Plain, load_recipe
 from tensordict import TensorDict
 from torch import Tensor
 
 from agility_rl import keys
+from agility_rl.envs import LocomotionEnv
 from agility_rl.go2 import constants
+from agility_rl.simulation import BatchSimulator
 
-SHOWN = ("bare", "simulator", "env.step", "roll-out", "iteration")
+SHOWN = ("bare", "simulator", "env.step", "roll-out", "iteration", "plain loop")
+START = 400
+"""First iteration; by then all ramps are over."""
 OURS = ("agility_rl", "recipes")
 
 
@@ -70,16 +77,50 @@ def waits() -> Iterator[Counter[str]]:
             torch.cuda.set_sync_debug_mode("default")
 
 
+Bare = tuple[Callable[[Tensor], None], Callable[[], None]]
+"""A control step of an engine alone, and what puts its robots where a simulator's are."""
+
+
+def bare_batch(env: LocomotionEnv) -> Bare:
+    """MuJoCo's own batch on the same model and threads."""
+    simulator = env.simulator
+    batch = Batch(simulator.model, env.num_robots, simulator.num_threads)
+    control = batch.bind("ctrl")
+
+    def step(target: Tensor) -> None:
+        control[:] = target.numpy()
+        batch.step(nstep=simulator.substeps)
+
+    def begin() -> None:
+        batch.state[:] = simulator.batch.state
+
+    return step, begin
+
+
+def bare_warp(env: LocomotionEnv) -> Bare:
+    """Mujoco-warp on the device of the environment."""
+    from engines import bare_warp
+
+    step, position, velocity = bare_warp(env.num_robots, env.device)
+
+    def begin() -> None:
+        state = env.simulator
+        position.copy_(torch.cat((state.root_position, state.root_quaternion, state.joint_position), -1))
+        velocity.copy_(torch.cat((state.root_linear_velocity, state.root_angular_velocity, state.joint_velocity), -1))
+
+    return step, begin
+
+
 def contenders(parts: Any, steps: int) -> tuple[dict[str, Callable[[], object]], Callable[[], None]]:
     """What is timed in turns; each takes so many control steps, the roll-out those of its preset.
 
     Beside them what comes before each turn: the bare engine's robots are put where the simulator's are.
     """
     env, robots = parts.env, parts.env.num_robots
+    bare, begin = (bare_batch if isinstance(env.simulator, BatchSimulator) else bare_warp)(env)
     pose = torch.tensor(constants.DEFAULT_POSE, device=env.device)
     scale = torch.tensor(constants.ACTION_SCALE, device=env.device)
     targets = pose + 0.05 * torch.randn(steps, robots, 12, generator=env.generator, device=env.device)
-    bare, position, velocity = bare_warp(robots, env.device)
     policy = parts.bbc.privileged_policy()
     env.reset()
 
@@ -88,11 +129,6 @@ def contenders(parts: Any, steps: int) -> tuple[dict[str, Callable[[], object]],
 
     def step_env(target: Tensor) -> None:
         env.step(TensorDict({keys.ACTION: (target - pose) / scale}, [robots]))
-
-    def begin() -> None:
-        state = env.simulator
-        position.copy_(torch.cat((state.root_position, state.root_quaternion, state.joint_position), -1))
-        velocity.copy_(torch.cat((state.root_linear_velocity, state.root_angular_velocity, state.joint_velocity), -1))
 
     return {
         "bare": every(bare),
@@ -104,7 +140,8 @@ def contenders(parts: Any, steps: int) -> tuple[dict[str, Callable[[], object]],
 
 def measure(recipe: ModuleType, cfg: Any, args: argparse.Namespace, look: bool) -> None:
     """Print the figures of one number of robots; ``look`` for waits too."""
-    parts, robots, device = recipe.build(cfg), cfg.env.num_robots, torch.device(args.device)
+    parts, robots = recipe.build(cfg), cfg.env.num_robots
+    device = parts.env.device
     turns, begin = contenders(parts, args.steps)
     found: dict[str, list[float]] = {name: [] for name in turns}
     for turn in range(args.rounds + 1):
@@ -116,15 +153,24 @@ def measure(recipe: ModuleType, cfg: Any, args: argparse.Namespace, look: bool) 
     steps = dict.fromkeys(turns, args.steps) | {"roll-out": cfg.ppo.steps}
     rate = {name: robots * steps[name] / statistics.median(times) for name, times in found.items()}
     share = statistics.median(bare / env for bare, env in zip(found["bare"], found["env.step"], strict=True))
-    laps: list[dict[str, float]] = []
-    spent = [seconds(lambda: laps.append(recipe.iterate(parts, cfg, 400 + len(laps))), device) for _ in range(4)]
-    rate["iteration"] = robots * cfg.ppo.steps / statistics.median(spent[1:])
-    most = torch.cuda.max_memory_allocated() / 2**30 if device.type == "cuda" else math.nan
-    print(f"{robots:8}" + "".join(f"{rate[name]:12.0f}" for name in SHOWN) + f"{share:12.1%}{most:8.1f}")
+    loops = {"iteration": lambda number: recipe.iterate(parts, cfg, number)}
+    if cfg.simulator == "batch":
+        own = recipe.build(cfg)
+        loops["plain loop"] = Plain(cfg, own.env, own.dataset).iterate
+    laps: dict[str, list[dict[str, float]]] = {name: [] for name in loops}
+    times: dict[str, list[float]] = {name: [] for name in loops}
+    for number in range(START, START + args.rounds + 1):
+        for name, iterate in loops.items():
+            times[name].append(seconds(lambda run=iterate, at=number, lap=laps[name]: lap.append(run(at)), device))
+    rate |= {name: robots * cfg.ppo.steps / statistics.median(spent[1:]) for name, spent in times.items()}
+    most = torch.cuda.max_memory_allocated() if device.type == "cuda" else 1024 * getrusage(RUSAGE_SELF).ru_maxrss
     print(
-        "         an iteration, s: " + ", ".join(f"{name} {laps[-1][f'time/{name}']:.3f}" for name in PHASES),
-        flush=True,
+        f"{robots:8}"
+        + "".join(f"{rate.get(name, math.nan):12.0f}" for name in SHOWN)
+        + f"{share:12.1%}{most / 2**30:8.1f}"
     )
+    last = laps["iteration"][-1]
+    print("         an iteration, s: " + ", ".join(f"{name} {last[f'time/{name}']:.3f}" for name in PHASES), flush=True)
     for name in ("env.step", "roll-out") if look else ():
         with waits() as places:
             turns[name]()
@@ -137,18 +183,21 @@ def measure(recipe: ModuleType, cfg: Any, args: argparse.Namespace, look: bool) 
 def main() -> None:
     """Time and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robots", type=int, nargs="+", default=[1024, 4096, 16384])
-    parser.add_argument("--device", default="cuda", help="of Warp and of everything else")
+    parser.add_argument("--robots", type=int, nargs="+", default=[256, 1024, 4096])
+    parser.add_argument("--simulator", choices=("batch", "warp"), default="batch", help="engine")
+    parser.add_argument("--device", default="cuda", help="of warp and of everything else with it")
     parser.add_argument("--preset", default="cpu", help="preset of bbc_pretrain.py")
     parser.add_argument("--steps", type=int, default=24, help="control steps of a turn")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each contender")
     args = parser.parse_args()
-    recipe, there = load_recipe(), torch.device(args.device).type == "cuda"
-    print(torch.cuda.get_device_name() if there else "CPU", f"- torch {torch.__version__}, control steps a second")
+    recipe, there = load_recipe(), args.simulator == "warp" and torch.device(args.device).type == "cuda"
+    name = torch.cuda.get_device_name() if there else f"CPU, {torch.get_num_threads()} threads"
+    print(name, f"- torch {torch.__version__}, control steps a second")
     print(f"{'robots':>8}" + "".join(f"{name:>12}" for name in SHOWN) + f"{'env/bare':>12}{'GiB':>8}")
     for robots in args.robots:
         preset = recipe.PRESETS[args.preset]
-        cfg = replace(preset, simulator="warp", device=args.device, env=replace(preset.env, num_robots=robots))
+        sized = replace(preset.env, num_robots=robots)
+        cfg = replace(preset, simulator=args.simulator, device=args.device, env=sized)
         measure(recipe, cfg, args, look=there and robots == args.robots[-1])
         gc.collect()
         torch.cuda.empty_cache()
