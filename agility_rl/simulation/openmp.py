@@ -6,9 +6,7 @@ import ctypes
 import sys
 from collections.abc import Callable
 
-import torch  # brings the OpenMP library whose function is looked up below
-
-assert torch
+import torch  # noqa: F401 brings the OpenMP library whose function is looked up below
 
 _SOFT = 1
 """``omp_pause_soft``: what threads hold stays as it is."""
