@@ -10,7 +10,7 @@ and in brackets the lowest and highest seed.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import torch
@@ -20,21 +20,21 @@ from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.record import read_scalars
 from agility_rl.record.plots import new_figure, save_figure
 
-SHOWN = {
-    "reward of a step": [f"reward/{name}" for name in ("imitation", "skill", "shift", "task")],
-    "skill recovered": [f"recovery/{name}" for name in BEHAVIOURS],
-    "speed error [m/s]": ["error/speed"],
-    "falls a minute": ["falls_per_minute"],
+SHOWN: dict[str, tuple[Callable[..., Tensor], list[str]]] = {
+    "reward of a step": (torch.sum, [f"reward/{name}" for name in ("imitation", "skill", "shift", "task")]),
+    "skill recovered": (torch.mean, [f"recovery/{name}" for name in BEHAVIOURS]),
+    "speed error [m/s]": (torch.sum, ["error/speed"]),
+    "falls a minute": (torch.sum, ["falls_per_minute"]),
 }
-"""What is drawn, and the metrics of which it is the sum or, of the skills, the mean."""
+"""What is drawn, and the sum or mean of which metrics it is."""
 LAST = 10
 """Iterations that the table averages."""
 
 
 def curve(scalars: Mapping[str, tuple[Tensor, Tensor]], title: str) -> Tensor:
     """One entry an iteration."""
-    parts = torch.stack([scalars[name][1] for name in SHOWN[title]])
-    return parts.mean(0) if title == "skill recovered" else parts.sum(0)
+    together, names = SHOWN[title]
+    return together(torch.stack([scalars[name][1] for name in names]), 0)
 
 
 def main() -> None:
@@ -47,6 +47,11 @@ def main() -> None:
         if not runs:
             parser.error(f"--group {name}: expected a name and at least one run after it")
     groups = {name: [read_scalars(run) for run in runs] for name, *runs in options.group}
+    needed = {metric for _, names in SHOWN.values() for metric in names}
+    for name, *runs in options.group:
+        for run, scalars in zip(runs, groups[name], strict=True):
+            if missing := needed - scalars.keys():
+                parser.error(f"{run}: expected a run of bbc_pretrain.py, got one without {', '.join(sorted(missing))}")
     length = min(len(run["time/minutes"][1]) for runs in groups.values() for run in runs)
     print(f"{length} iterations")
     figure = new_figure(9.0, 4.8)
