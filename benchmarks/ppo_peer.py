@@ -27,7 +27,7 @@ from peer import Peer, serve
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-OBSERVED, ACTIONS, STEPS, HIDDEN = 79, 12, 24, (512, 256, 128)
+OBSERVED, ACTIONS, STEPS, HIDDEN = 90, 12, 24, (512, 256, 128)
 """What the basic controller's policy sees and does, and the layers of section S6."""
 GAMMA, LAMBDA, CLIP, VALUE, ENTROPY, RATE, DIVERGENCE = 0.99, 0.95, 0.2, 1.0, 0.01, 1e-3, 0.01
 Weights = dict[str, list[Tensor]]

@@ -99,9 +99,9 @@ def bare_batch(env: LocomotionEnv) -> Bare:
 
 def bare_warp(env: LocomotionEnv) -> Bare:
     """Mujoco-warp on the device of the environment."""
-    from engines import bare_warp
+    import engines  # needs mujoco-warp
 
-    step, position, velocity = bare_warp(env.num_robots, env.device)
+    step, position, velocity = engines.bare_warp(env.num_robots, env.device)
 
     def begin() -> None:
         state = env.simulator
