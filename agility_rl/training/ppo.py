@@ -47,9 +47,9 @@ class PPOUpdate:
     """Descends a PPO loss over a collected batch.
 
     Advantages are normalised over the whole batch, or within each group of it. After each epoch the divergence between
-    the policy that collected and the present one, on 1024 samples of the last minibatch, may change the learning rate.
-    Of several processes (:mod:`agility_rl.training.distributed`), each brings a batch: moments, gradients and
-    divergence are those of all.
+    the policy that collected and the present one, on at most 1024 samples of the last minibatch, may change the
+    learning rate. Of several processes (:mod:`agility_rl.training.distributed`), each brings a batch: moments,
+    gradients and divergence are those of all.
 
     Source: Schulman et al. 2017, arXiv:1707.06347; Table S1 (clip, learning rate); normalisation and adaptive rate:
     released code (method notes, section 3.7).
