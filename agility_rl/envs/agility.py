@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.agility_rewards import AGILITY_REWARDS, TERMINATION, TERMINATION_TERM, AgilityTerm
@@ -28,6 +27,7 @@ from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.envs.outcome import DecisionOutcome, outcome_specs
 from agility_rl.envs.progress import GOAL_RADIUS, Events
 from agility_rl.envs.randomization import Randomization
+from agility_rl.envs.resets import MaskedResets
 from agility_rl.envs.robots import Pushes, Robots
 from agility_rl.envs.scandots import NUM_SCANDOTS
 from agility_rl.go2 import camera, features
@@ -41,7 +41,7 @@ COURSE_RANDOMIZATION = Randomization(gain=(1.0, 1.0), action_delay=(0.02, 0.02))
 """Friction, mass and centre of mass as in stage 1, nominal gains, one step of delay (method notes, section 5.11)."""
 
 
-class AgilityEnv(EnvBase):
+class AgilityEnv(MaskedResets):
     """``N`` Go2 robots that pass the obstacles of a course.
 
     A step takes a decision, a behaviour and six parameters for each of the five, and holds it for ``decision_steps``

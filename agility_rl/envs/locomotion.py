@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from agility_rl import behaviours, keys, rotations
 from agility_rl.envs.commands import CommandSampler
@@ -17,6 +16,7 @@ from agility_rl.envs.encounters import NUM_OBSERVED, PIECES, Encounters
 from agility_rl.envs.observations import ObservationGroups
 from agility_rl.envs.randomization import Randomization, uniform
 from agility_rl.envs.reference import ReferenceStates
+from agility_rl.envs.resets import MaskedResets
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm
 from agility_rl.envs.rhythm import Rhythm
 from agility_rl.envs.robots import CLEARANCE, Pushes, Robots
@@ -30,7 +30,7 @@ EDGE = 1.0
 """How far beyond the square of the starts an episode on a height field goes on [m]; the field ends a metre further."""
 
 
-class LocomotionEnv(EnvBase):
+class LocomotionEnv(MaskedResets):
     """``N`` Go2 robots that move in a commanded behaviour at a commanded velocity and height.
 
     A step takes joint targets ``q* = q_default + scale * action``, holds them for one control step, and returns named
