@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from learning_rates import half_cosine, set_learning_rate
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
@@ -32,7 +33,6 @@ from agility_rl.modules.placed_memory import PlacedMemory
 from agility_rl.modules.planar import inverted, moved
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 from agility_rl.training import distributed
-from agility_rl.training.seeding import permutation
 
 ERRORS = (
     "error_latent",
@@ -50,6 +50,8 @@ WEIGHTS = (1.0, 1.0, 4.0, 0.0, 1.0, 0.0, 0.0)
 LEVERS = (1.0, 1.0, 3.0, 3.0)
 """Of x, y, sine and cosine of the yaw in the place's: who is turned by a radian too much at what stands 3 m ahead errs
 by 3 m across it, and the yaw is what robots err by before an obstacle (docs/student.md)."""
+ROUND = 20
+"""Steps of one learning rate, where it falls along half a cosine."""
 Represent = Callable[[Tensor], dict[str, Tensor]]
 """One step of another loss of the encoder, on stored images."""
 
@@ -208,7 +210,7 @@ def asked(seen: TensorDictBase, latent: Tensor) -> TensorDictBase:
 
 @torch.no_grad()
 def collect_images(env: AgilityEnv, teacher: Teacher, cfg: GlanceConfig, bits: int) -> TensorDictBase:
-    """Let the teacher walk and keep every ``every``-th decision's images: :func:`asked`, ``[T, N]``."""
+    """Let the teacher walk and keep every ``every``-th decision's images: :func:`asked`, ``[N, T]``."""
     # The teacher has no memory: what the collector carries for it is a number that stays what it is.
     remember = TensorDictModule(nn.Identity(), in_keys=[keys.HIDDEN], out_keys=[("memory", keys.HIDDEN)])
     walker = DAggerCollector(
@@ -220,11 +222,14 @@ def collect_images(env: AgilityEnv, teacher: Teacher, cfg: GlanceConfig, bits: i
         bits=16 if bits == 16 else 8,
         keep=(keys.DEPTH, keys.SCANDOTS, keys.OBSTACLE, keys.PLACE, keys.PROGRESS),
     )
-    rows = []
-    for _ in range(-(-cfg.images // env.num_robots)):
-        seen = walker.collect()[0].clone()  # a view would keep the whole window
-        rows.append(asked(seen, known_terrain(teacher, seen)))
-    return torch.stack(rows)  # type: ignore[return-value, arg-type]
+    images, count = None, -(-cfg.images // env.num_robots)
+    for time in range(count):
+        seen = walker.collect()[0]
+        row = asked(seen, known_terrain(teacher, seen))
+        images = row.new_empty((env.num_robots, count)) if images is None else images
+        images[:, time] = row
+    assert images is not None
+    return images
 
 
 def pretrain(
@@ -232,18 +237,29 @@ def pretrain(
 ) -> dict[str, float]:
     """Collect images where the teacher walks, learn from most robots', measure on the others'.
 
+    The learning rate falls along half a cosine. Some of the images remain among the newest.
+
     Returns:
         How many, and :data:`ERRORS` of those held out.
     """
     images = collect_images(env, teacher, cfg, bits)
-    robots = images.batch_size[1]
+    robots = len(images)
     apart = min(max(1, round(cfg.held_out * robots)), robots - 1)
-    train, test = images[:, apart:].flatten(), images[:, :apart].flatten()
-    glances.images.extend(train[permutation(len(train), glances.generator)])
+    train, test = images[apart:].flatten(), images[:apart].flatten()
+    newest, glances.images = glances.images, Newest(len(train))
+    glances.images.rows = train  # not extended: they are gigabytes, and would be copied
     metrics: dict[str, float] = {"pretrain/images": float(len(train))}
+    steps = max(1, len(train) // cfg.batch)
     for epoch in range(cfg.epochs):
-        glances.learn(max(1, len(train) // cfg.batch), 0, represent)
+        for step in range(epoch * steps, (epoch + 1) * steps, ROUND):
+            share = step / (cfg.epochs * steps)
+            set_learning_rate(glances.optimizer, half_cosine(cfg.pretrain_learning_rate, share, step))
+            glances.learn(min(ROUND, (epoch + 1) * steps - step), 0, represent)
         metrics |= {f"pretrain/{name}": value for name, value in glances.measure(test).items()}
         shown = "  ".join(f"{name} {metrics[f'pretrain/{name}']:.3g}" for name in ERRORS)
-        print(f"pre-training {epoch + 1}/{cfg.epochs} on {len(train)} images; {len(test)} held out: {shown}")
+        print(
+            f"pre-training {epoch + 1}/{cfg.epochs} on {len(train)} images; {len(test)} held out: {shown}", flush=True
+        )
+    newest.extend(glances.images.draw(min(newest.most, len(train)), glances.generator))
+    glances.images = newest
     return metrics

@@ -214,8 +214,8 @@ def _run(
             if logger is not None and display is not None:
                 logger.log_metrics(metrics, step=int(progress["iteration"]))
                 display.update(int(progress["iteration"]), metrics)
-            if progress["iteration"] % cfg.checkpoint_every == 0:
-                save()
+            if progress["iteration"] == 1 or progress["iteration"] % cfg.checkpoint_every == 0:
+                save()  # after the first one too: what comes once before a training is part of it, and may take long
             late = cfg.max_minutes is not None and progress["minutes"] >= cfg.max_minutes
             if distributed.anyone(late):
                 break

@@ -16,21 +16,21 @@ Out: ``runs/NAME/`` with ``config.json``, ``policy/`` (kind ``student``), and th
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 import tyro
-from glances import Glances
+from glances import ROUND, Glances
+from learning_rates import half_cosine, set_learning_rate
 from safetensors.torch import load_file
 from tensordict import TensorDict, TensorDictBase
 from tsc_artifacts import Trained, load_trained
 from tsc_images import IMAGES_FILE
 from tsc_setup import course_of
 from tsc_student_config import AugmentationConfig, GlanceConfig
-from tsc_student_setup import make_augmentation, set_learning_rate
+from tsc_student_setup import make_augmentation
 
 from agility_rl import keys
 from agility_rl.deploy.artifact import Artifact
@@ -39,12 +39,8 @@ from agility_rl.training import cli
 from agility_rl.training.precision import Precision, hidden_precision
 from agility_rl.training.seeding import seed_everything
 
-WARM_UP = 400
-"""Steps in which the learning rate rises: the optimiser begins anew on weights that may be good already."""
 ENCODER = ("encoder_channels", "encoder_hidden", "encoder_features")
 """Sizes of the encoder."""
-ROUND = 20
-"""Steps between two looks at the clock."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +129,7 @@ def teach(glances: Glances, test: TensorDictBase, cfg: Config) -> dict[str, floa
     """Learn for the given time, print errors now and then; returns the last ones."""
     start, steps, reported = time.monotonic(), 0, 0
     while (share := (time.monotonic() - start) / (60.0 * cfg.minutes)) < 1.0:
-        rate = 0.5 * cfg.learning_rate * (1.0 + math.cos(math.pi * share)) * min(1.0, (steps + 1) / WARM_UP)
-        set_learning_rate(glances.optimizer, rate)
+        set_learning_rate(glances.optimizer, half_cosine(cfg.learning_rate, share, steps))
         found = glances.learn(ROUND, steps)
         steps += ROUND
         if share * cfg.reports >= reported:

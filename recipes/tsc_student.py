@@ -23,19 +23,18 @@ from pathlib import Path
 import torch
 from course_metrics import judge, set_course
 from glances import asked, known_terrain, pretrain
+from learning_rates import annealed, set_learning_rate
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from training_run import Laps, finite, own_options, run
 from tsc_student_config import PRESETS, Config
 from tsc_student_setup import (
     Components,
-    annealed,
     build,
     frozen_parts,
     load_student,
     resolve,
     save_policy,
-    set_learning_rate,
 )
 
 from agility_rl import keys

@@ -124,10 +124,12 @@ class GlanceConfig:
     """Decisions between two images of a robot that are kept."""
     epochs: int = 4
     """Of the pre-training."""
+    pretrain_learning_rate: float = 1e-3
+    """Of the pre-training; falls along half a cosine to 0."""
     batch: int = 128
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-4
-    """Falls as that of the imitation does."""
+    """During the imitation; falls as that of the imitation does."""
     kept: int = 40_000
     """Newest images, of which the steps draw."""
     held_out: float = 0.1
@@ -197,7 +199,7 @@ CPU = Config(
     encoder_features=128,
     glance_hidden=(256, 256, 256),
     heading_gate=4.0,
-    env=EnvConfig(num_robots=64, randomize=False, push_interval=None, command_noise=(0.97, 1.03), start_spread=2.0),
+    env=EnvConfig(num_robots=64, randomize=False, push_interval=None, command_noise=(0.97, 1.03), start_spread=3.0),
     imitation=ImitationConfig(
         steps=48,
         epochs=4,
@@ -210,7 +212,15 @@ CPU = Config(
         led_until=160,
     ),
     representation=RepresentationConfig(images=384, minibatches=1),
-    glance=GlanceConfig(steps=32, images=60_000, every=2, epochs=12, kept=60_000),
+    glance=GlanceConfig(
+        images=480_000,
+        every=1,
+        epochs=8,
+        steps=8,
+        learning_rate=3e-4,
+        final_learning_rate=1e-5,
+        kept=60_000,
+    ),
     curriculum=CurriculumConfig(difficulty=1.0, obstacles=6, practice=1.0),
 )
 SMOKE = replace(

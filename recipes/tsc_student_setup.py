@@ -257,17 +257,6 @@ def load_student(parts: Components, path: Path, kept: tuple[str, ...]) -> None:
     parts.student.load_state_dict(weights | own_parts)
 
 
-def annealed(first: float, last: float, iteration: int, length: int) -> float:
-    """Falls linearly from the first to the last value, and stays there."""
-    return first + (last - first) * min(iteration / length, 1.0)
-
-
-def set_learning_rate(optimizer: torch.optim.Optimizer, value: float) -> None:
-    """Of all parameters."""
-    for group in optimizer.param_groups:
-        group["lr"] = value
-
-
 def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     """Write the student as an artifact, with what is needed to run it elsewhere."""
     manifest = build_manifest(
