@@ -190,7 +190,7 @@ class Config(HardwareConfig):
 PAPER = Config()
 CPU = Config(
     iterations=450,
-    max_minutes=90.0,
+    max_minutes=120.0,
     checkpoint_every=25,
     byol=False,
     precision="auto",
