@@ -147,6 +147,19 @@ def test_only_the_newest_images_are_kept(module: Module) -> None:
     assert torch.equal(one, two) and set(one.tolist()) <= {15, 16, 17, 18, 19}
 
 
+def test_of_the_images_that_come_first_some_remain(recipe: ModuleType, module: Module, smoke: Any) -> None:
+    setup, glances = module("tsc_student_setup"), module("glances")
+    cfg = replace(smoke, glance=replace(smoke.glance, images=30, kept=5, epochs=2))
+    parts = setup.build(*setup.resolve(cfg))
+    newest = parts.glances.images
+    metrics = glances.pretrain(parts.glances, parts.env, parts.teacher, cfg.glance, 8, None)
+    assert metrics["pretrain/images"] == 3 * 8, "of four robots one is held out; eight decisions are 30 images or more"
+    assert parts.glances.images is newest and len(newest.rows) == 5
+    assert newest.rows["depth"].dtype == torch.uint8
+    assert parts.glances.optimizer.param_groups[0]["lr"] < cfg.glance.pretrain_learning_rate / glances.ROUND
+    parts.env.close()
+
+
 def test_glances_of_the_same_images_lower_their_errors(recipe: ModuleType, module: Module, smoke: Any) -> None:
     setup = module("tsc_student_setup")
     nothing = replace(smoke.augmentation, rectangle=0.0, white_noise=0.0, dropout=0.0, blur=0.0)
