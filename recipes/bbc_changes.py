@@ -11,8 +11,7 @@ from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.envs.obstacles import BOX_HALF
 
 CHANGEABLE: tuple[str, ...] = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight", "env.progress_left")
-CHANGEABLE += ("env.lowest_box", "env.highest_box", "env.standing_starts", "env.canter_stance")
-CHANGEABLE += ("env.walk_emphasis", "env.pace_emphasis")
+CHANGEABLE += ("env.lowest_box", "env.highest_box", "env.standing_starts", "env.canter_stance", "env.walk_emphasis")
 CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
 """Options that may change during a run."""
 
@@ -32,7 +31,6 @@ def check(cfg: Config) -> None:
         ("lowest_box", 0.0, 2.0 * BOX_HALF[2], "a height of boxes [m]"),
         ("highest_box", 0.0, 2.0 * BOX_HALF[2], "a height of boxes [m]"),
         ("walk_emphasis", 0.0, math.inf, "a factor of at least 0"),
-        ("pace_emphasis", 0.0, math.inf, "a factor of at least 0"),
     ):
         later = [value for _, option, value in cfg.changes if option.replace("-", "_") == f"env.{name}"]
         if bad := [value for value in (getattr(cfg.env, name), *later) if not least <= value <= most]:

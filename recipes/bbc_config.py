@@ -87,8 +87,6 @@ class EnvConfig:
     walk_emphasis: float = 1.0
     """How many times as much the walk's rhythm is paid as that of the other behaviours (ours): of the most that it can
     earn by it, ``pretrained/bbc`` earns 0.28 when it walks, 0.59 to 0.83 else."""
-    pace_emphasis: float = 1.0
-    """The same of the pace (ours): where turns are paid, a trot that turns earns more than a pace that does not yet."""
     canter_stance: float = 0.0
     """Share of time for which a cantering foot shall stand more than in the labelled clips (ours). Those run at 1.9 to
     3.3 m/s, commands at 0.8 to 2: a robot that has to stand as shortly as they do goes faster than told. Dogs cantering

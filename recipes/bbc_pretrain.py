@@ -220,7 +220,6 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     if parts.env.rhythm is not None:
         parts.env.rhythm.longer_stance[BEHAVIOURS.index("canter")] = cfg.env.canter_stance
         parts.env.rhythm.emphasis[BEHAVIOURS.index("walk")] = cfg.env.walk_emphasis
-        parts.env.rhythm.emphasis[BEHAVIOURS.index("pace")] = cfg.env.pace_emphasis
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     set_boxes(parts.env, cfg.env)
     shares = torch.tensor(cfg.env.shares) if cfg.env.shares else parts.prior.sampling_probabilities

@@ -34,7 +34,6 @@ EVERYTHING = (
     *("--imitation.information-ramp", "2", "4", "--adaptation.privileged-ramp", "3", "2", "--adaptation.every", "3"),
     *("--changes", "5", "ppo.entropy", "0.002", "6", "env.jump-weight", "9.0", "3", "env.standing-starts", "0.5"),
     *("6", "env.progress-left", "7.0", "5", "env.canter-stance", "0.1", "4", "env.walk-emphasis", "2.0"),
-    *("5", "env.pace-emphasis", "3.0"),
     "--ppo.by-behaviour",
 )
 """Whatever is random, and ramps and changes on both sides of the middle of eight iterations."""
@@ -195,7 +194,6 @@ def test_options_change_at_their_iterations(module: Callable[[str], ModuleType])
             "--env.standing-starts: expected a share from 0 to 1",
         ),
         (("--changes", "3", "env.canter-stance", "3"), "--env.canter-stance: expected a share of time, got 3.0"),
-        (("--env.pace-emphasis", "-1"), "--env.pace-emphasis: expected a factor of at least 0, got -1.0"),
         (("--env.walk-emphasis", "-1"), "--env.walk-emphasis: expected a factor of at least 0, got -1.0"),
         (("--trials.start", "1", "--trials.every", "0"), "--trials.every: expected at least 1, got 0"),
         (("--trials.seconds", "1.5"), "--trials.seconds: expected at least 2, got 1.5"),
