@@ -17,7 +17,7 @@ class MaskedResets(EnvBase):
     """
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Begin anew where ``done`` says so."""
+        """Begin anew in the rows of ``[N]`` whose ``done`` [N, 1] is set: what a step came to, with their observations."""
         if self.device.type != "cpu":
             return masked_reset(self, tensordict)
         found: TensorDictBase = super().maybe_reset(tensordict)
