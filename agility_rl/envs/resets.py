@@ -17,7 +17,7 @@ class MaskedResets(EnvBase):
     """
 
     def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Begin anew in the rows of ``[N]`` whose ``done`` [N, 1] is set: what a step came to, with their observations."""
+        """Of what came of a step, ``[N]``, begin anew the rows whose ``done`` [N, 1] is set."""
         if self.device.type != "cpu":
             return masked_reset(self, tensordict)
         found: TensorDictBase = super().maybe_reset(tensordict)
