@@ -34,6 +34,10 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "none": (),
     "labels_3_percent": ("--motion.label-share", "0.03"),
     "labels_1_percent": ("--motion.label-share", "0.01"),
+    "no_labels": (
+        *("--motion.label-share", "0", "--imitation.no-conditional", "--imitation.labelled-share", "0"),
+        *("--imitation.warm-up", "0", "--imitation.cloning", "0", "--env.rhythm-weight", "0"),
+    ),
     "no_information": ("--imitation.information", "0"),
     "prior_raw": ("--imitation.prior-temperature", "None"),
     "no_mirror": ("--motion.no-mirror",),
@@ -45,7 +49,8 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     ),
 }
 """What each variant adds to the command. ``none`` lacks nothing; ``prior_raw`` draws skills from the learned prior as
-it is, which the preset makes almost even; ``task_only`` pays for commands and regularity alone, from a random start."""
+it is, which the preset makes almost even; ``no_labels`` looks at no clip's name, and ``task_only`` pays for commands
+and regularity alone, both from a random start."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,8 @@ CHANGEABLE: tuple[str, ...] = ("ppo.entropy", "ppo.desired_kl", "env.jump_weight
 CHANGEABLE += ("env.lowest_box", "env.highest_box", "env.standing_starts", "env.canter_stance", "env.walk_emphasis")
 CHANGEABLE += tuple(f"imitation.{reward}_reward" for reward in ("imitation", "skill", "shift", "task"))
 """Options that may change during a run."""
+NAMED: tuple[str, ...] = ("conditional", "labelled_share", "warm_up", "cloning", "cloning_weight")
+"""Options of the imitation that need labels."""
 
 
 def check(cfg: Config) -> None:
@@ -35,6 +37,11 @@ def check(cfg: Config) -> None:
         later = [value for _, option, value in cfg.changes if option.replace("-", "_") == f"env.{name}"]
         if bad := [value for value in (getattr(cfg.env, name), *later) if not least <= value <= most]:
             raise ValueError(f"--env.{name.replace('_', '-')}: expected {expected}, got {bad[0]}")
+    if cfg.motion.label_share == 0.0:
+        named = {f"--imitation.{name.replace('_', '-')}": getattr(cfg.imitation, name) for name in NAMED}
+        named["--env.rhythm-weight"] = cfg.env.rhythm_weight
+        if needed := [option for option, value in named.items() if value]:
+            raise ValueError(f"--motion.label-share 0: expected {', '.join(needed)} off, for they need labels")
     if cfg.env.lowest_box > cfg.env.highest_box:
         raise ValueError(
             f"--env.lowest-box: expected at most --env.highest-box, {cfg.env.highest_box}, got {cfg.env.lowest_box}"

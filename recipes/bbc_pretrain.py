@@ -62,20 +62,13 @@ def update_imitation(parts: Components, cfg: ImitationConfig, iteration: int) ->
         batch = TensorDict({"policy": policy, "labelled": labelled, "unlabelled": unlabelled})
         batch["expert"] = expert_batch(parts, cfg, policy, unlabelled)
         discriminated, predicted = parts.discriminator_loss(batch), parts.predictor_loss(batch)
-        loss = (
-            discriminated["loss_discriminator"]
-            + discriminated["loss_gradient_penalty"]
-            + discriminated["loss_regularization"]
-            + predicted["loss_skill"]
-            + predicted["loss_shift"]
-            + predicted["loss_information"]
-        )
+        found = dict(discriminated.items()) | dict(predicted.items())
         parts.imitation_optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        torch.stack([value for name, value in found.items() if name.startswith("loss_")]).sum().backward()
         distributed.average_gradients(optimized(parts.imitation_optimizer))
         parts.imitation_optimizer.step()
         parts.prior.update(distributed.average(recorded_shares(parts, cfg, predicted)))
-        for name, value in (*discriminated.items(), *predicted.items()):
+        for name, value in found.items():
             if value.numel() == 1:
                 totals[name] = totals.get(name, torch.zeros(())) + value.detach() / cfg.minibatches
     return totals

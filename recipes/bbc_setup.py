@@ -207,7 +207,10 @@ def build(cfg: Config) -> Components:
         discriminator_loss=DiscriminatorLoss(
             discriminator, criterion=im.criterion, gradient_penalty=im.gradient_penalty
         ),
-        predictor_loss=PredictorLoss(predictor),
+        # Without labels only the marginal entropy keeps Q^c from taking all motion for one behaviour.
+        predictor_loss=PredictorLoss(predictor, labelled=None, marginal=1.0)
+        if cfg.motion.label_share == 0.0
+        else PredictorLoss(predictor),
         adaptation_loss=adaptation_loss,
         privileged_loss=privileged_loss(bbc.privileged_encoder),
         estimation_loss=StateEstimationLoss(bbc.estimator),

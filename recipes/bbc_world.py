@@ -38,7 +38,7 @@ SHORTEST = 0.5
 
 def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv:
     """Robots that start in the middle of the dogs' motion."""
-    reference = starts(dataset, seeds.generator("reference"))
+    reference = starts(dataset, seeds.generator("reference"), named=cfg.motion.label_share != 0.0)
     terrain = make_terrain(cfg.env, torch.Generator().manual_seed(seeds.integer("terrain")))
     randomization = Randomization() if cfg.env.randomize else NOMINAL if cfg.env.action_delay else None
     model: dict[str, Any] = {"friction_loss": cfg.env.friction_loss}
@@ -95,10 +95,12 @@ def rewards(cfg: EnvConfig) -> dict[str, RewardTerm]:
     return terms
 
 
-def starts(dataset: MotionDataset, generator: torch.Generator, each: int = 2000) -> TensorDict:
-    """States of dogs in motion to start an episode from, ``each`` of every behaviour."""
+def starts(dataset: MotionDataset, generator: torch.Generator, each: int = 2000, named: bool = True) -> TensorDict:
+    """States of dogs in motion to start an episode from, ``each`` of every behaviour; unless ``named``, of any."""
     skills = torch.arange(len(BEHAVIOURS), device=generator.device).repeat_interleave(each)
-    return dataset.sample_states(skills, generator).set("skill", skills)
+    states = dataset.sample_states(skills, generator)
+    order = slice(None) if named else torch.randperm(len(skills), generator=generator, device=generator.device)
+    return states.set("skill", skills[order])
 
 
 def make_terrain(cfg: EnvConfig, generator: torch.Generator) -> HeightField | None:
@@ -118,7 +120,7 @@ def load_dataset(cfg: MotionConfig, seed: int) -> MotionDataset:
         labelled, unlabelled = synthetic_dataset_clips(seed)
     else:
         labelled, unlabelled = load_clips(cfg.labelled, label="from name"), load_clips(cfg.unlabelled)
-    if cfg.label_share is not None:
+    if cfg.label_share:
         labelled = fewer_labels(labelled, cfg.label_share, sum(clip.duration for clip in (*labelled, *unlabelled)))
     return MotionDataset(
         labelled,
@@ -134,7 +136,7 @@ def load_dataset(cfg: MotionConfig, seed: int) -> MotionDataset:
 def fewer_labels(labelled: list[MotionClip], share: float, total: float) -> list[MotionClip]:
     """The same time of every behaviour, as far as there is so much of it: ``share`` of ``total`` seconds in all."""
     if not 0.0 < share <= 1.0:
-        raise ValueError(f"--motion.label-share: expected more than 0 and at most 1, got {share}")
+        raise ValueError(f"--motion.label-share: expected a share from 0 to 1, got {share}")
     kept: list[MotionClip] = []
     for name in BEHAVIOURS:
         left = share * total / len(BEHAVIOURS)

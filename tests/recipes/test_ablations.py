@@ -24,18 +24,20 @@ def test_trainings_end_in_a_table_go_on_where_they_stopped_and_are_not_done_twic
     run = tmp_path / "ablation_none_0"
     started = recipe("bbc_pretrain", "smoke", "--name", run.name, "--runs", tmp_path, "--iterations", 1)
     assert started.returncode == 0, started.stderr
-    arguments = ("--preset", "smoke", "--runs", tmp_path, "--variants", "none", "no_information", *SHORT)
+    arguments = ("--preset", "smoke", "--runs", tmp_path, "--variants", "none", "no_labels", *SHORT)
     result = recipe("ablations", *arguments)
     assert result.returncode == 0, result.stdout + result.stderr
     lines = (tmp_path / "ablations.md").read_text().splitlines()
-    assert [line.split("|")[1].strip() for line in lines] == ["without", "---", "none", "no information"]
+    assert [line.split("|")[1].strip() for line in lines] == ["without", "---", "none", "no labels"]
     found = json.loads((tmp_path / "ablations.json").read_text())["rows"]
     evaluated = json.loads((run / "evaluation.json").read_text())
     assert found["none"][0]["targets"] == sum(target["passed"] for target in evaluated["targets"])
     assert found["none"][0]["falls"] == evaluated["falls"]["estimate"]
     assert read_scalars(run)["time/minutes"][0].tolist() == [1, 2], "the second iteration only"
-    kept = json.loads((tmp_path / "ablation_no_information_0" / "config.json").read_text())["config"]
-    assert kept["imitation"]["information"] == 0.0
+    nameless = tmp_path / "ablation_no_labels_0"
+    assert json.loads((nameless / "config.json").read_text())["config"]["motion"]["label_share"] == 0.0
+    assert "loss_skill" in read_scalars(run) and "loss_marginal" not in read_scalars(run)
+    assert "loss_skill" not in read_scalars(nameless) and "loss_marginal" in read_scalars(nameless)
     again = recipe("ablations", *arguments)
     assert again.returncode == 0 and "bbc_pretrain" not in again.stdout
 

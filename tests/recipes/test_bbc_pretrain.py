@@ -152,6 +152,7 @@ def test_a_killed_run_goes_on(tmp_path: Path, moment: str) -> None:
         (("--motion.labelled", "nowhere", "--motion.unlabelled", "nowhere"), "nowhere"),
         (("--motion.labelled", "nowhere"), "give both"),
         (("--env.terrain", "lava"), "flat"),
+        (("--motion.label-share", "0"), "expected --imitation.conditional, --imitation.labelled-share"),
         (("--resume", "nowhere"), "nothing to resume"),
     ],
 )

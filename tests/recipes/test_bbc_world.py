@@ -49,5 +49,11 @@ def test_fewer_labels_are_alike_of_every_behaviour_and_of_the_longest_clips(modu
     smoke = module("bbc_presets").SMOKE
     whole, part = (world.load_dataset(replace(smoke.motion, label_share=share), 0) for share in (None, 0.02))
     assert 0 < sum(c.duration for c in part.labelled_clips) < 0.6 * sum(c.duration for c in whole.labelled_clips)
-    with pytest.raises(ValueError, match=r"--motion.label-share: expected more than 0 and at most 1, got 0"):
+    nameless, named = (
+        world.starts(part, torch.Generator().manual_seed(0), each=20, named=named) for named in (False, True)
+    )
+    assert torch.equal(nameless["joint_position"], named["joint_position"])
+    assert torch.equal(nameless["skill"].bincount(), named["skill"].bincount())
+    assert (nameless["skill"] == named["skill"]).float().mean() < 0.5
+    with pytest.raises(ValueError, match=r"--motion.label-share: expected a share from 0 to 1, got 0"):
         world.fewer_labels(clips, 0.0, total)
