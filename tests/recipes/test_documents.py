@@ -19,6 +19,7 @@ DOCUMENTS = sorted(
     [REPOSITORY / "README.md", *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("pretrained/*/README.md")]
 )
 COMMAND = re.compile(r"(?:python|torchrun)\S* (?:-\S+ \S+ )*((?:recipes|benchmarks)/\w+\.py)([^`\n]*)")
+EXAMPLE = re.compile(r"```python\n(.*?)```", re.DOTALL)
 FOLDER = re.compile(r"pretrained/\w+")
 
 
@@ -33,6 +34,11 @@ def commands(document: Path) -> list[tuple[str, list[str]]]:
 
 
 ALL = [(document, *command) for document in DOCUMENTS for command in commands(document)]
+
+
+@pytest.mark.parametrize("example", EXAMPLE.findall((REPOSITORY / "README.md").read_text(encoding="utf-8")))
+def test_an_example_of_the_readme_runs(example: str) -> None:
+    exec(compile(example, "README.md", "exec"), {})
 
 
 def test_commands_are_found() -> None:
