@@ -10,7 +10,7 @@ from typing import Any
 from agility_rl.deploy.browser import LOOPBACK, BrowserDevice, exposure
 from agility_rl.deploy.controller import StepRecord
 from agility_rl.deploy.gamepad import GamepadDevice
-from agility_rl.deploy.operator import Device, Operation, Status, Stick
+from agility_rl.deploy.operator import STOP, Device, Operation, Status, Stick
 from agility_rl.deploy.terminal import TerminalDevice
 
 
@@ -27,17 +27,22 @@ class ControlsConfig:
 
 
 class Both:
-    """A gamepad to steer, a page to look at; keys of both count."""
+    """A gamepad to steer, a page to look at; keys of both count, and to pull the gamepad out is a stop."""
 
     def __init__(self, held: Device, seen: Device) -> None:
         self.held, self.seen = held, seen
+        self._pulled = False
 
     def read(self) -> Sequence[str | Stick]:
         """What came in from both."""
-        return [*self.held.read(), *self.seen.read()]
+        entries = [*self.held.read(), *self.seen.read()]
+        if self.held.ended() and not self._pulled:  # else the robot would go on with where its sticks stood last
+            self._pulled = True
+            entries.append(STOP)
+        return entries
 
     def connected(self) -> bool:
-        """Whether what is held in the hand is there; without it, whether the page is."""
+        """Whether what is held in the hand is there; without it, whether the page is, which can go on after a stop."""
         return self.seen.connected() if self.held.ended() else self.held.connected()
 
     def ended(self) -> bool:

@@ -8,7 +8,7 @@ Out: one MCAP file that opens in Foxglove and rerun, and is a robot log for reci
 
     python recipes/deploy.py pretrained/bbc --transport mujoco --seconds 20 --skill trot --speed 1.0
     python recipes/deploy.py pretrained/bbc --transport dds                    # a simulated Go2 that speaks DDS
-    python recipes/deploy.py exported/bbc --transport dds --interface eth0     # a real one: docs/deployment.md first
+    python recipes/deploy.py exported/bbc --transport dds --interface eth0 --operator terminal    # docs/deployment.md!
     python recipes/deploy.py pretrained/bbc --transport lcm                    # a simulated robot, over LCM
     python recipes/deploy.py pretrained/bbc --operator terminal                # drive it by hand
     python recipes/deploy.py pretrained/bbc_leaping --task pretrained/student_leaping --course full
@@ -66,6 +66,8 @@ class Config(RobotConfig, ControlsConfig, PolicyConfig):
     """Artifact folder of a BBC, or a run with one."""
     operator: Literal["script", "browser", "terminal", "gamepad"] = "script"
     """Who drives: a script (stand up, one command, stop), or a person, until the device or Ctrl-C ends it."""
+    unattended: bool = False
+    """Let a script drive a real robot: it stands up at once, without asking."""
     seconds: float = 20.0
     """With a script: time in the behaviour, without standing up and sinking down."""
     skill: str = "trot"
@@ -121,9 +123,9 @@ class Procedure:
 
 
 def free_file(folder: Path) -> Path:
-    """``deploy_N.mcap`` with the first N that is free."""
+    """``deploy_N.mcap`` with the first N that is free; what a killed run has left in writing is not overwritten."""
     number = 0
-    while (folder / f"deploy_{number}.mcap").exists():
+    while any((folder / name).exists() for name in (f"deploy_{number}.mcap", f".deploy_{number}.mcap.incoming")):
         number += 1
     return folder / f"deploy_{number}.mcap"
 
@@ -160,6 +162,11 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
     if path.suffix != ".mcap" or path.exists():
         raise ValueError(f"expected --output to be a new file that ends in .mcap, got {path}")
     cfg.check()
+    if cfg.real and cfg.operator == "script" and not cfg.unattended:
+        raise ValueError(
+            "a script makes a real robot stand up and run at once: give --operator terminal, browser or gamepad, "
+            "with which every change of mode is yours, or --unattended"
+        )
     if cfg.task is not None and cfg.camera is None and cfg.transport != "mujoco":
         raise ValueError(
             "a student looks by a camera: the simulated robot of --transport mujoco has one, for any other give "
@@ -210,8 +217,9 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
         try:
             controller.run(until=lambda: procedure.finished or interrupted())
             controller.on_step = record
-            for _ in range(round(SINK_SECONDS / bbc.period)):
-                controller.step()
+            if controller.mode is Mode.DAMPING:  # not if another program has the robot, which was never driven
+                for _ in range(round(SINK_SECONDS / bbc.period)):
+                    controller.step()
         finally:
             gc.unfreeze()
     print(summary(controller, None if robot is None else robot.lost, started))

@@ -56,13 +56,13 @@ def load_camera(text: str) -> Any:
     """A camera of the user's own: ``MODULE:NAME``, called without arguments; files beside the working folder count.
 
     Raises:
-        ValueError: if there is no such module or name, or what it gives has no ``latest()``.
+        ValueError: if there is no such module or name, it does not come up, or what it gives has no ``latest()``.
     """
     module, _, name = text.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:
         camera = getattr(importlib.import_module(module), name)()
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, ValueError, RuntimeError) as error:  # drivers raise the last
         raise ValueError(f"--camera: expected MODULE:NAME of a class or function, got {text!r}: {error}") from error
     finally:
         sys.path.pop(0)

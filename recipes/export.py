@@ -44,6 +44,7 @@ from agility_rl.deploy.artifact import CHECKSUM, Artifact, ArtifactError, build_
 from agility_rl.go2 import features
 from agility_rl.modules import RecurrentStudent
 from agility_rl.training import cli
+from agility_rl.training.checkpoint import publish
 
 SAME_ANSWER = 1e-5
 """Largest difference of an output between the training policy and the deployed network, and between that by PyTorch and
@@ -263,8 +264,11 @@ def main(cfg: Config) -> Path:
     }
     output.mkdir(parents=True, exist_ok=True)
     onnx_file = output / entry["file"]
-    present = onnx_file.exists()
-    onnx_file.write_bytes(content)
+    present = onnx_file.is_file() and onnx_file.read_bytes() == content
+    if not present:
+        staged = output / f".{onnx_file.name}.incoming"
+        staged.write_bytes(content)
+        publish(staged, onnx_file)
     try:
         trial = Artifact(source.state, {**source.manifest, "onnx": entry}, output)
         entry["largest_difference"] = check_onnx(export, trial, answers)

@@ -104,9 +104,7 @@ def load_trained(path: Path, kind: str | None = None, allowed: Sequence[str] | N
             names = ", ".join(behaviours.BEHAVIOURS[index] for index in known)
             raise ValueError(f"--behaviours: expected some of those that it was trained with, {names}; got {allowed}")
     module = NETWORKS[manifest["kind"]](**network)
-    mask = module.actor.network.mask.clone()
     artifact.fill(module)
-    module.actor.network.mask.copy_(mask)
     return Trained(module, artifact, run, tuple(network["allowed"] or known))
 
 

@@ -144,9 +144,7 @@ def make_learner(
 
 def limit_deviations(actor: HybridActor, ppo: PPOConfig) -> None:
     """Let a trained actor begin with the deviations of the options: at least the floor, at most the initial one."""
-    head = actor.network.parameters_head
-    head.min_std.fill_(ppo.min_std)
-    head.std.data.clamp_(ppo.min_std, ppo.initial_std)
+    actor.network.parameters_head.std.data.clamp_(ppo.min_std, ppo.initial_std)
 
 
 @torch.no_grad()

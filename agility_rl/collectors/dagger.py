@@ -100,8 +100,8 @@ class DAggerCollector:
             raise ValueError(f"the teacher reads {missing}, which the environment does not write")
         self.env, self.student, self.teacher = env, student, teacher
         self.num_steps, self.bits = num_steps, bits
-        own = {hidden_key, "is_init"}
-        if missing := [key for key in student.in_keys if key not in observed | own]:
+        self._own = {hidden_key, "is_init"}
+        if missing := [key for key in student.in_keys if key not in observed | self._own]:
             raise ValueError(f"the student reads {missing}, which the environment does not write")
         self.keep = [*dict.fromkeys([*(key for key in student.in_keys if key != hidden_key), *keep])]
         self.keep_written = list(keep_written)
@@ -131,10 +131,13 @@ class DAggerCollector:
             row = carrier.select(*self.keep).update(acting.select(*self.keep_written))
             action, label = _decision(acting.get(self.action_key)), _decision(label)
             if self.led:
+                action = action.clone()  # a mean that is kept may be the same memory
                 action[: self.led] = label[: self.led]
             row.set(self.action_key, action)
             row.set(self.label_key, label)
-            full, upcoming = self.env.step_and_maybe_reset(row.select(self.action_key).clone())
+            # Whatever else the environment has written, since its transforms may count in it.
+            before = carrier.exclude(*self._own).set(self.action_key, action.clone())
+            full, upcoming = self.env.step_and_maybe_reset(before)
             row.set("next", full.get("next").select(*self.keep_next))
             rows.append(row)
             carrier = self._carry(upcoming, acting.get(self.next_hidden_key), full.get(("next", "done")))
@@ -162,6 +165,8 @@ class DAggerCollector:
         self._carrier = None if carrier is None else TensorDict(carrier, self.env.batch_size)
 
 
-def _decision(action: TensorDictBase) -> TensorDictBase:
+def _decision(action: TensorDictBase | Tensor) -> TensorDictBase | Tensor:
     """An action without its log-probabilities."""
+    if isinstance(action, Tensor):
+        return action
     return action.exclude(*(key for key in list(action.keys()) if key.endswith("_log_prob")))

@@ -182,8 +182,12 @@ class Controller:
 
     # -- from outside ------------------------------------------------------------------------------------------------
     def request(self, mode: Mode) -> None:
-        """Ask for a mode; the next control step grants or refuses it. May be called from another thread."""
-        self._request = mode
+        """Ask for a mode; the next control step grants or refuses it. May be called from another thread.
+
+        Damping that was asked for is not undone by what is asked for after it.
+        """
+        if self._request is not Mode.DAMPING:
+            self._request = mode
 
     def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> None:
         """Step at 50 Hz for some time, or until something holds; leaves the robot in damping."""
@@ -196,7 +200,12 @@ class Controller:
             self.stop("the run has ended")
 
     def stop(self, reason: str = "stopped") -> None:
-        """Send damping at once, and remain there."""
+        """Send damping at once, and remain there; silent while passive and somebody else commands the robot.
+
+        For the thread that steps; from another one, ``request(Mode.DAMPING)`` does it within a control step.
+        """
+        if self.mode is Mode.PASSIVE and self.transport.other_commanders():
+            return
         self._enter(Mode.DAMPING, reason)
         self.transport.send(JointCommand.damped(DAMPING_GAIN))
 

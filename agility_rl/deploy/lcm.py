@@ -185,7 +185,8 @@ class LCMTransport:
                 state, robot, names = unpack_state(*newest)
                 if self._state is None:
                     self._head, self._robot = newest[0][:HEAD], robot
-                if self._state is None or state.sequence >= self._state.sequence:  # datagrams may overtake each other
+                # Datagrams may overtake each other, and a bridge may repeat the last word of a robot that is silent.
+                if self._state is None or state.sequence > self._state.sequence:
                     self._state, self.joint_names = state, names
             if strange is not None:
                 unpack_state(strange, 0.0)  # says why, if it cannot be understood

@@ -45,7 +45,10 @@ recipes/export.py
             f"{artifact.folder / name} has SHA-256 {digest[:12]}, expected {str(entry.get('sha256'))[:12]} made from "
             f"weights {artifact.manifest['weights']['sha256'][:12]}: altered, or of another training; export it again"
         )
-    import onnxruntime
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise ImportError("ONNX files need onnxruntime: pip install 'agility_rl[deploy]'") from error
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1

@@ -176,7 +176,7 @@ class RobotProcess:
         lost: simulated seconds by which it fell behind; known after the end.
 
     Raises:
-        RuntimeError: if the process does not come up.
+        ConnectionError: if the process does not come up.
     """
 
     def __init__(
@@ -200,7 +200,7 @@ class RobotProcess:
         first = self._process.stdout.readline()
         if not first:
             self._process.communicate()
-            raise RuntimeError(
+            raise ConnectionError(
                 f"the robot's process ended with status {self._process.returncode} before it began; see its message"
             )
         self.port: int = json.loads(first)["port"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -15,6 +16,10 @@ from agility_rl.go2 import constants
 
 VENDOR_TORQUE_LIMIT = (23.7, 23.7, 45.43) * 4
 """Largest joint torques that the vendor states [N m]; policies are trained with less."""
+CLOCK_TOLERANCE = 0.5
+"""What arrives while a control step is held up may be so much younger than its beginning [s]."""
+UNIT_TOLERANCE = 0.05
+"""How far the length of an orientation may be from 1."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +94,9 @@ class Fault:
 
 # Checks --------------------------------------------------------------------------------------------------------------
 def stale(age: float | None, limit: float) -> str | None:
-    """Older than allowed, or never heard.
+    """Older than allowed, never heard, or from the future: then another clock dated it, and its age is unknown.
+
+    What is dated infinity never grows old.
 
     Example:
         >>> stale(0.3, 0.05)
@@ -97,6 +104,8 @@ def stale(age: float | None, limit: float) -> str | None:
     """
     if age is None:
         return "never arrived"
+    if -math.inf < age < -CLOCK_TOLERANCE:
+        return f"is dated {-age:.3g} s ahead, expected a time of time.monotonic()"
     return None if age <= limit else f"is {1e3 * age:.0f} ms old, expected at most {1e3 * limit:.0f} ms"
 
 
@@ -155,6 +164,17 @@ def too_large(value: Tensor, limit: Tensor, unit: str) -> str | None:
         return None
     index = int(over.nonzero()[0])
     return f"joint {index} has {value[index]:.1f} {unit}, expected at most {limit[index]:.1f}"
+
+
+def no_orientation(quaternion: Tensor) -> str | None:
+    """No unit quaternion: the sensor has not spoken yet, and whoever took that for an orientation would stand upright.
+
+    Example:
+        >>> no_orientation(torch.zeros(4))
+        'the quaternion has length 0.00, expected 1'
+    """
+    length = float(torch.linalg.vector_norm(quaternion))
+    return None if abs(length - 1.0) <= UNIT_TOLERANCE else f"the quaternion has length {length:.2f}, expected 1"
 
 
 def tilted(quaternion: Tensor, limit: float) -> str | None:
@@ -247,7 +267,7 @@ class Safety:
         return _first(("missed deadlines", late(missed, self.limits.missed_deadlines)), *ages)
 
     def check_state(self, state: RobotState | None, now: float) -> Fault | None:
-        """Age, finiteness, joints, tilt."""
+        """Age, finiteness, joints, orientation, tilt."""
         old = stale(None if state is None else now - state.time, self.limits.state_age)
         if state is None or old:
             return Fault("stale state", f"the state {old}")
@@ -262,6 +282,7 @@ class Safety:
             ),
             ("joint speed", self._sustain("joint speed", too_large(state.joint_velocity, self._speed, "rad/s"))),
             ("joint torque", self._sustain("joint torque", too_large(state.joint_torque, self._torque, "N m"))),
+            ("orientation", no_orientation(state.quaternion)),
             ("tilt", tilted(state.quaternion, self.limits.tilt)),
         )
 

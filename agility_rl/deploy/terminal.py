@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import queue
 import re
 import select
 import sys
+import threading
 from collections.abc import Sequence
 from typing import Any, TextIO
 
@@ -29,6 +32,8 @@ SEQUENCES: dict[bytes, str] = {
 """What a terminal sends, and our names of keys; other printable characters are their own names."""
 SHOW_EVERY = 5
 """Looks at the robot between two lines that are written."""
+CLOSE_SECONDS = 0.2
+"""Longest wait for a screen that does not take its last line [s]."""
 ESCAPE = b"\x1b"
 TOKEN = re.compile(rb"\x1b[\[O][0-9;]*[A-Za-z~]|.", re.DOTALL)
 """A key with a sequence of its own, known or not, or one byte."""
@@ -55,10 +60,11 @@ def keys_in(received: bytes) -> list[str]:
 
 
 class TerminalDevice:
-    """Reads keys without waiting for the end of a line; Ctrl-C works as ever.
+    """Reads keys without waiting for the end of a line; Ctrl-C works as ever, Ctrl-S and Ctrl-Z halt nothing.
 
-    It counts as connected while its input is open. A connection that breaks ends the program by the system's own
-    signal, and the motors damp without commands.
+    It counts as connected while its input is open. A connection that is closed ends the input, or the program by the
+    system's signal (:func:`agility_rl.training.cli.interruptible`); one that goes dead without a word is not noticed
+    before its own time is out. Lines are written by a thread: a screen that does not take them holds nobody up.
 
     Args:
         keys: where keys come from; the standard input by default.
@@ -79,7 +85,20 @@ class TerminalDevice:
         self._termios = termios
         self._before: list[Any] | None = termios.tcgetattr(self._file)
         tty.setcbreak(self._file)
+        now = termios.tcgetattr(self._file)
+        now[0] &= ~termios.IXON
+        now[6][termios.VSUSP] = b"\0"
+        termios.tcsetattr(self._file, termios.TCSADRAIN, now)
         self._open, self._shown, self._rest = True, 0, b""
+        self._lines: queue.Queue[str | None] = queue.Queue(maxsize=1)
+        self._writer = threading.Thread(target=self._write, name="screen", daemon=True)
+        self._writer.start()
+
+    def _write(self) -> None:
+        with contextlib.suppress(OSError):  # the other end of the terminal has gone
+            while (text := self._lines.get()) is not None:
+                self._screen.write(text)
+                self._screen.flush()
 
     def read(self) -> Sequence[str | Stick]:
         """Keys since the last call; an escape waits for the next call, since it may be half of an arrow."""
@@ -109,8 +128,8 @@ class TerminalDevice:
         if self._shown % SHOW_EVERY == 0:
             columns = os.get_terminal_size(self._file).columns or 80
             text = "  ".join(" ".join(words.split()) for _, words in status.lines())
-            self._screen.write("\r\x1b[K" + text[: columns - 1])
-            self._screen.flush()
+            with contextlib.suppress(queue.Full):  # the line before is still being written
+                self._lines.put_nowait("\r\x1b[K" + text[: columns - 1])
         self._shown += 1
 
     def close(self) -> None:
@@ -118,5 +137,11 @@ class TerminalDevice:
         if self._before is not None:
             self._termios.tcsetattr(self._file, self._termios.TCSADRAIN, self._before)
             self._before = None
-            self._screen.write("\n")
-            self._screen.flush()
+            try:
+                for last in ("\n", None):
+                    self._lines.put(last, timeout=CLOSE_SECONDS)
+            except queue.Full:  # the thread ends once the screen takes what it is writing
+                with contextlib.suppress(queue.Empty):
+                    self._lines.get_nowait()
+                self._lines.put(None)
+            self._writer.join(CLOSE_SECONDS)

@@ -15,6 +15,11 @@ from agility_rl.envs.obstacles import OBSTACLES, Obstacle, Points
 
 GOAL_DISTANCE = 4.0
 """A robot further than this from its goal has lost its way [m] (method notes, section 5.6)."""
+LONGEST_WAY = 3.5
+"""Longest way between two way-points [m]: the next one counts when a robot is within the radius of goals of the first,
+up to 0.45 m before it, and whoever is farther from it than :data:`GOAL_DISTANCE` is lost."""
+ROOM = 0.6
+"""What a robot needs behind a first way-point to start there [m]: half its length, and up to 0.2 m (section 5.7)."""
 WALL_HEIGHT = 0.72
 """Height of the walls [m] (section 5.7)."""
 TALLEST_WALL = 5.0
@@ -148,10 +153,10 @@ class Course:
                     gap = math.dist(
                         _world(self.slots[first], leaving.goals[-1]), _world(self.slots[second], coming.goals[0])
                     )
-                    if gap > GOAL_DISTANCE:
+                    if gap > LONGEST_WAY:
                         raise CourseError(
                             f"course {self.name!r}: the way from slot {first} ({leaving.obstacle}) to slot {second} "
-                            f"({coming.obstacle}) is {gap:.2f} m, expected at most {GOAL_DISTANCE} m between "
+                            f"({coming.obstacle}) is {gap:.2f} m, expected at most {LONGEST_WAY} m between "
                             "way-points; move the slots together or add way-points"
                         )
 
@@ -162,6 +167,8 @@ class Course:
                 extent = kind.kind.half_extents
                 points = [_world(slot, (x * extent[0], y * extent[1])) for x, y in corners]
                 points += [_world(slot, point) for point in kind.goals]
+                if self.wall_height is not None:  # robots start behind the first one, and are as long as that
+                    points.append(_world(slot, (kind.goals[0][0] - ROOM, kind.goals[0][1])))
                 for x, y in points:
                     if not (
                         slot.jitter.x <= x <= self.size[0] - slot.jitter.x
@@ -169,8 +176,8 @@ class Course:
                     ):
                         raise CourseError(
                             f"course {self.name!r}, slot {index} ({kind.obstacle}) reaches ({x:.2f}, {y:.2f}) m, "
-                            f"expected it, its way-points and its jitter inside {self.size[0]} x {self.size[1]} m; "
-                            "move it or enlarge size"
+                            f"expected it, its way-points, {ROOM} m behind the first and its jitter inside "
+                            f"{self.size[0]} x {self.size[1]} m; move it or enlarge size"
                         )
             for other in range(index):
                 for one, two in self._pairs(other, index):
@@ -206,8 +213,8 @@ def _check_slot(slot: Slot, where: str) -> None:
     if not slot.goals:
         raise CourseError(f"{where}: no way-points; expected at least one, or leave them to the type")
     for first, second in pairwise(slot.goals):
-        if math.dist(first, second) > GOAL_DISTANCE:
-            raise CourseError(f"{where}: way-points {first} and {second} are more than {GOAL_DISTANCE} m apart")
+        if math.dist(first, second) > LONGEST_WAY:
+            raise CourseError(f"{where}: way-points {first} and {second} are more than {LONGEST_WAY} m apart")
     if slot.difficulty is None:
         return
     known = slot.kind.difficulty

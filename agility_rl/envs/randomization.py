@@ -6,7 +6,7 @@ gain multipliers 0.8 to 1.2 per joint.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -77,6 +77,20 @@ def sample_parameters(
         del fields["action_delay"]
     if ranges.draw is not None:
         fields |= ranges.draw(num_robots, generator)
-    known = ("trunk_mass_offset", "trunk_com_offset", "ground_friction")
-    gains = fields["stiffness"] / constants.STIFFNESS - 1.0, fields["damping"] / constants.DAMPING - 1.0
-    return fields, torch.cat((*(fields[name] for name in known), *gains), -1)
+    return fields, described(fields)
+
+
+DESCRIBED = ("trunk_mass_offset", "trunk_com_offset", "ground_friction", "stiffness", "damping")
+"""Parameters that the privileged observation holds, in its order."""
+
+
+def described(parameters: Mapping[str, Tensor]) -> Tensor:
+    """The privileged observation ``[N, 29]`` of these parameters, gains as deviations from the nominal ones.
+
+    Example:
+        >>> fields, privileged = sample_parameters(2, Randomization(), torch.Generator().manual_seed(0))
+        >>> bool((described(fields) == privileged).all())
+        True
+    """
+    *known, stiffness, damping = (parameters[name] for name in DESCRIBED)
+    return torch.cat((*known, stiffness / constants.STIFFNESS - 1.0, damping / constants.DAMPING - 1.0), -1)

@@ -57,11 +57,11 @@ def velocity_progress(state: LocomotionState) -> Tensor:
     Ours: it pays nothing for standing and has a slope there, where the exponential of :func:`linear_velocity` has
     almost none, and it is as steep for a slow walk as for a canter. What goes sideways is the exponential's part.
     The mean of the last half second counts: within a stride the speed of a walking dog changes by a third, and
-    who is paid for a constant one shuffles.
+    who is paid for a constant one shuffles. Where none is commanded any direction is the commanded one.
     """
-    wanted = state.command[:, :2]
+    wanted, shown = state.command[:, :2], state.mean_velocity[:, :2]
     speed = wanted.norm(dim=-1)
-    along = (wanted * state.mean_velocity[:, :2]).sum(-1) / speed.clamp(min=1e-6)
+    along = torch.where(speed > 0.0, (wanted * shown).sum(-1) / speed.clamp(min=1e-6), shown.norm(dim=-1))
     return (1.0 - (along - speed).abs() / speed.clamp(min=SLOW)).clamp(min=-1.0)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from agility_rl import rotations
 from agility_rl.envs.commands import CommandSampler
-from agility_rl.envs.randomization import NOMINAL, Randomization, sample_parameters, uniform
+from agility_rl.envs.randomization import DESCRIBED, NOMINAL, Randomization, described, sample_parameters, uniform
 from agility_rl.envs.state import LocomotionState
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import Simulator
@@ -65,8 +65,9 @@ class Robots:
         )
         self.mean_velocity, self.mean_yaw_rate = torch.zeros(n, 3, device=device), torch.zeros(n, device=device)
         self.heights = torch.zeros(n, round(features.PEAK_WINDOW / self.dt), device=device)
-        fields, self.privileged = sample_parameters(n, NOMINAL, generator)
-        self.stiffness, self.damping = fields["stiffness"], fields["damping"]
+        sample_parameters(n, NOMINAL, generator)  # what is drawn afterwards is then what results were drawn with
+        present = {name: simulator.parameter(name) for name in DESCRIBED}
+        self.privileged, self.stiffness, self.damping = described(present), present["stiffness"], present["damping"]
 
     def step(self, action: Tensor) -> None:
         """Hold joint targets ``q_default + scale * action`` for one control step."""

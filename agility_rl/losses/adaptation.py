@@ -9,6 +9,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 
 from agility_rl.keys import ESTIMATE, EXPLICIT, LATENT
+from agility_rl.losses.functional import missed
 from agility_rl.losses.keyed import KeyedLoss
 
 
@@ -71,10 +72,11 @@ class StateEstimationLoss(KeyedLoss):
         tensordict = tensordict.clone(False)
         with self.estimator_params.to_module(self.estimator, preserve_module_state=False):
             estimate = self.estimator(tensordict.select(*self.estimator.in_keys)).get(self.tensor_keys.estimate)
-        error = (estimate - tensordict.get(self.tensor_keys.target).detach()).square().mean(-1)  # [*B]
+        target = tensordict.get(self.tensor_keys.target)
+        error = missed(estimate, target, self.tensor_keys.target).square().mean(-1)  # [*B]
         out = TensorDict()
         out.set("loss_estimation", self._reduce_loss(error, tensordict))
-        out.set("error_estimation", error.detach().mean().sqrt())
+        out.set("error_estimation", self._mean(error, tensordict).sqrt())
         self._clear_weakrefs(tensordict, out, "estimator_params", "target_estimator_params")
         return out
 
@@ -180,7 +182,7 @@ class AdaptationLoss(KeyedLoss):
         out = TensorDict()
         out.set("loss_adaptation", self.history * self._reduce_loss(adaptation, tensordict))
         out.set("loss_privileged", self.privileged * self._reduce_loss(regularization, tensordict))
-        out.set("error_adaptation", adaptation.detach().mean())
+        out.set("error_adaptation", self._mean(adaptation, tensordict))
         self._clear_weakrefs(
             tensordict,
             out,

@@ -154,11 +154,10 @@ class DiscriminatorLoss(KeyedLoss):
         expert_term = self._reduce_loss(expert_term, expert_group)
         out.set("loss_discriminator", expert_term + self._reduce_loss(policy_term, policy_group))
         out.set("loss_regularization", self._regularization())
-        expert_logit, policy_logit = expert_logit.detach(), policy_logit.detach()
-        out.set("accuracy_expert", (expert_logit > 0).to(expert_logit.dtype).mean())
-        out.set("accuracy_policy", (policy_logit < 0).to(policy_logit.dtype).mean())
-        out.set("logit_expert", expert_logit.mean())
-        out.set("logit_policy", policy_logit.mean())
+        out.set("accuracy_expert", self._mean((expert_logit > 0).to(expert_logit.dtype), expert_group))
+        out.set("accuracy_policy", self._mean((policy_logit < 0).to(policy_logit.dtype), policy_group))
+        out.set("logit_expert", self._mean(expert_logit, expert_group))
+        out.set("logit_policy", self._mean(policy_logit, policy_group))
         self._clear_weakrefs(tensordict, out, "discriminator_params", "target_discriminator_params")
         return out
 

@@ -16,6 +16,24 @@ Criterion = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """``(expert logit, policy logit) -> (expert term, policy term)``, each of the shape of its logit."""
 
 
+def missed(estimate: Tensor, target: Tensor, key: object) -> Tensor:
+    """Target minus estimate, of one shape; the target gets no gradient.
+
+    Raises:
+        ValueError: if the shapes differ: they might be broadcast to one that compares every sample with every other.
+
+    Example:
+        >>> missed(torch.zeros(2, 1), torch.ones(2), "shift")
+        Traceback (most recent call last):
+        ValueError: expected 'shift' of shape [2, 1], as it is estimated, got [2]
+    """
+    if estimate.shape != target.shape:
+        raise ValueError(
+            f"expected {key!r} of shape {list(estimate.shape)}, as it is estimated, got {list(target.shape)}"
+        )
+    return target.detach() - estimate
+
+
 def least_squares(expert_logit: Tensor, policy_logit: Tensor) -> tuple[Tensor, Tensor]:
     r"""Least-squares criterion of a discriminator: dogs towards +1, policy towards -1.
 
@@ -158,7 +176,7 @@ def shift_reward(estimate: Tensor, shift: Tensor) -> Tensor:
         >>> shift_reward(torch.tensor([[0.5]]), torch.tensor([[-0.5]]))
         tensor([[-1.]])
     """
-    return -(estimate - shift).abs().mean(-1, keepdim=True)
+    return -missed(estimate, shift, "shift").abs().mean(-1, keepdim=True)
 
 
 def conditional_entropy(skill_logits: Tensor) -> Tensor:

@@ -209,9 +209,9 @@ class HybridPPOLoss(KeyedLoss):
         with torch.no_grad():
             for head, ratio in log_ratio.items():
                 outside = ratio.expm1().abs() > self.clip_epsilon
-                out.set(f"clip_fraction_{head}", outside.to(ratio.dtype).mean())
-                out.set(f"kl_{head}", divergence_estimate(ratio).mean())
-                out.set(f"entropy_{head}", entropy[head].mean())
+                out.set(f"clip_fraction_{head}", self._mean(outside.to(ratio.dtype), tensordict))
+                out.set(f"kl_{head}", self._mean(divergence_estimate(ratio), tensordict))
+                out.set(f"entropy_{head}", self._mean(entropy[head], tensordict))
         self._clear_weakrefs(
             tensordict, out, "actor_params", "target_actor_params", "critic_params", "target_critic_params"
         )
@@ -243,8 +243,8 @@ class HybridPPOLoss(KeyedLoss):
         batch_dims = _entry(tensordict, self.tensor_keys.advantage).ndim - 1
         return TensorDict(
             {
-                "discrete": _total(discrete, batch_dims).mean(),
-                "continuous": self._counted(continuous, choice, batch_dims).mean(),
+                "discrete": self._mean(_total(discrete, batch_dims), tensordict),
+                "continuous": self._mean(self._counted(continuous, choice, batch_dims), tensordict),
             }
         )
 

@@ -42,6 +42,15 @@ class KeyedLoss(LossModule):
         """As TorchRL's, beside the parameters: a number on the CPU cannot be the bound of a tensor on a GPU."""
         super().register_coeff_buffer(name, value, device=device or parameter_device(self), dtype=dtype)
 
+    def _mean(self, values: Tensor, group: TensorDictBase) -> Tensor:
+        """Mean of a metric ``[*B, ...]`` over the samples that count."""
+        return self._reduce_loss(values.detach(), group, reduction="mean")
+
+    def _counting(self, group: TensorDictBase) -> Tensor | None:
+        """Which samples of a group ``[*B]`` count, bool ``[*B]``, where it has a mask; else all do."""
+        masks = [mask for key in self._loss_mask_keys() if (mask := group.get(key, default=None)) is not None]
+        return torch.stack([mask.reshape(group.batch_size) for mask in masks]).all(0) if masks else None
+
 
 def parameter_device(module: nn.Module) -> torch.device | None:
     """Where a module's parameters are; ``None`` if it has none.

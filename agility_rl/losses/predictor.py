@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from torch.nn import functional
 
 from agility_rl.keys import SHIFT, SHIFT_ESTIMATE, SKILL, SKILL_LOGITS
-from agility_rl.losses.functional import conditional_entropy, marginal_entropy
+from agility_rl.losses.functional import conditional_entropy, marginal_entropy, missed
 from agility_rl.losses.keyed import KeyedLoss
 from agility_rl.losses.reduction import Reduction, check_reduction
 
@@ -163,12 +163,13 @@ class PredictorLoss(KeyedLoss):
                 # [*B, K], [*B] -> [N, K], [N] -> [*B]: cross_entropy wants the classes second
                 flat = functional.cross_entropy(logits.flatten(0, -2), label.flatten(), reduction="none")
                 out.set("loss_skill", self.labelled * self._reduce_loss(flat.reshape(label.shape), group))
-                out.set("accuracy_labelled", (logits.detach().argmax(-1) == label).to(logits.dtype).mean())
+                out.set("accuracy_labelled", self._mean((logits.argmax(-1) == label).to(logits.dtype), group))
             if self.shift is not None:
                 group = tensordict.get(keys.policy)
-                error = (self._predict(group).get(keys.shift_estimate) - group.get(keys.shift)).abs().mean(-1)
+                error = missed(self._predict(group).get(keys.shift_estimate), group.get(keys.shift), keys.shift)
+                error = error.abs().mean(-1)
                 out.set("loss_shift", self.shift * self._reduce_loss(error, group))
-                out.set("error_shift", error.detach().mean())
+                out.set("error_shift", self._mean(error, group))
             if self._reads_unlabelled:
                 self._write_unlabelled(tensordict.get(keys.unlabelled), out)
         self._clear_weakrefs(tensordict, out, "predictor_params", "target_predictor_params")
@@ -182,8 +183,9 @@ class PredictorLoss(KeyedLoss):
         entropy = conditional_entropy(logits)
         if self.information is not None:
             out.set("loss_information", self.information * self._reduce_loss(entropy, group))
+        out.set("entropy_unlabelled", self._mean(entropy, group))
+        counting = self._counting(group)
+        logits = logits.flatten(0, -2) if counting is None else logits[counting]
         if self.marginal is not None:
             out.set("loss_marginal", -self.marginal * marginal_entropy(logits))
-        out.set("entropy_unlabelled", entropy.detach().mean())
-        probability = logits.detach().softmax(-1)
-        out.set("unlabelled_skill_probability", probability.flatten(0, -2).mean(0))
+        out.set("unlabelled_skill_probability", logits.detach().softmax(-1).mean(0))

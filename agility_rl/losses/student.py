@@ -25,6 +25,7 @@ from agility_rl.keys import (
     PROGRESS_LOGITS,
     TERRAIN_LATENT,
 )
+from agility_rl.losses.functional import missed
 from agility_rl.losses.keyed import KeyedLoss, parameter_device
 
 
@@ -212,33 +213,35 @@ class StudentLoss(KeyedLoss):
             logits, choice = written.get(keys.logits), tensordict.get(keys.behaviour)
             error = _cross_entropy(logits, choice)
             out.set("loss_behaviour", self.behaviour * self._reduce_loss(error, tensordict))
-            out.set("accuracy_behaviour", (logits.detach().argmax(-1) == choice).float().mean())
+            out.set("accuracy_behaviour", self._mean((logits.argmax(-1) == choice).float(), tensordict))
         if self.continuous is not None:
-            difference = tensordict.get(keys.parameters).detach() - written.get(keys.loc)  # [*B, K, P]
+            difference = missed(written.get(keys.loc), tensordict.get(keys.parameters), keys.parameters)  # [*B, K, P]
             if self.compared == "selected":
                 chosen = tensordict.get(keys.behaviour)
                 difference = difference.take_along_dim(chosen[..., None, None], -2)
             error = torch.linalg.vector_norm(difference.flatten(-2), dim=-1)
             out.set("loss_parameters", self.continuous * self._reduce_loss(error, tensordict))
         if self.heading is not None:
-            difference = _wrap(tensordict.get(keys.heading_error).detach() - written.get(keys.heading_estimate))
+            estimate = written.get(keys.heading_estimate)
+            difference = _wrap(missed(estimate, tensordict.get(keys.heading_error), keys.heading_error))
             error = torch.linalg.vector_norm(self.heading_weights * difference, dim=-1)
             out.set("loss_heading", self.heading * self._reduce_loss(error, tensordict))
-            out.set("error_heading", difference.detach()[..., 0].abs().mean())
+            out.set("error_heading", self._mean(difference[..., 0].abs(), tensordict))
         if self.obstacle is not None:
             error, right = _classified(written.get(keys.obstacle_logits), tensordict.get(keys.obstacle))
             out.set("loss_obstacle", self.obstacle * self._reduce_loss(error, tensordict))
-            out.set("accuracy_obstacle", right)
+            out.set("accuracy_obstacle", self._mean(right, tensordict))
         if self.place is not None:
-            distance = (tensordict.get(keys.place).detach() - written.get(keys.place_estimate)).abs()
+            distance = missed(written.get(keys.place_estimate), tensordict.get(keys.place), keys.place).abs()
             out.set("loss_place", self.place * self._reduce_loss(distance.sum(-1), tensordict))
-            out.set("error_place", distance.detach()[..., :2].mean())
+            out.set("error_place", self._mean(distance[..., :2].mean(-1), tensordict))
         if self.progress is not None:
             error, right = _classified(written.get(keys.progress_logits), tensordict.get(keys.progress))
             out.set("loss_progress", self.progress * self._reduce_loss(error, tensordict))
-            out.set("accuracy_progress", right)
+            out.set("accuracy_progress", self._mean(right, tensordict))
         if self.latent is not None:
-            error = (tensordict.get(keys.latent).detach() - written.get(keys.terrain_latent)).square().mean(-1)
+            difference = missed(written.get(keys.terrain_latent), tensordict.get(keys.latent), keys.latent)
+            error = difference.square().mean(-1)
             out.set("loss_latent", self.latent * self._reduce_loss(error, tensordict))
         self._clear_weakrefs(tensordict, out, "network_params", "target_network_params")
         return out
@@ -250,9 +253,9 @@ def _cross_entropy(logits: Tensor, index: Tensor) -> Tensor:
 
 
 def _classified(logits: Tensor, one_hot: Tensor) -> tuple[Tensor, Tensor]:
-    """Cross-entropy ``[*B]``, and the share that is right."""
+    """Cross-entropy, and 1 where it is right, each ``[*B]``."""
     kind = one_hot.argmax(-1)
-    return _cross_entropy(logits, kind), (logits.detach().argmax(-1) == kind).float().mean()
+    return _cross_entropy(logits, kind), (logits.argmax(-1) == kind).float()
 
 
 def _wrap(angle: Tensor) -> Tensor:

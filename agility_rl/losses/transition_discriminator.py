@@ -150,8 +150,7 @@ class TransitionDiscriminatorLoss(KeyedLoss):
         if expert_penalty is not None and policy_penalty is not None:
             penalty = self._reduce_loss(expert_penalty, expert) + self._reduce_loss(policy_penalty, policy)
             out.set("loss_gradient_penalty", 0.5 * self.gradient_penalty * penalty)
-        expert_mean = self._reduce_loss(expert_logit.detach(), expert, reduction="mean")
-        policy_mean = self._reduce_loss(policy_logit.detach(), policy, reduction="mean")
+        expert_mean, policy_mean = self._mean(expert_logit, expert), self._mean(policy_logit, policy)
         out.set("logit_expert", expert_mean)
         out.set("logit_policy", policy_mean)
         out.set("distance", expert_mean - policy_mean)
@@ -160,7 +159,10 @@ class TransitionDiscriminatorLoss(KeyedLoss):
 
     def _judge(self, group: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         """Logits ``[*B, 1]`` of a group and, if asked for, their penalty ``[*B]``."""
+        counting = self._counting(group)
         group = group.select(*self.discriminator.in_keys)
+        if counting is not None:  # NaN in a row that does not count would still reach the weights: 0 NaN is NaN
+            group = group.masked_fill(~counting, 0.0)
         if self.gradient_penalty is None:
             return self.discriminator(group).get(self.tensor_keys.logit), None
         return penalized_logit(self.discriminator, group, self.tensor_keys.logit, self.tensor_keys.penalty_input)

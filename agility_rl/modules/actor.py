@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -158,7 +159,11 @@ class GaussianNetwork(nn.Module):
             raise ValueError(f"min_std must be positive and at most initial_std={initial_std}, got {floor.tolist()}")
         self.mean = mean
         self.std = nn.Parameter(torch.full((num_actions,), float(initial_std)))
-        self.register_buffer("min_std", floor)
+        self.register_buffer("min_std", floor, persistent=False)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        state_dict.pop(f"{prefix}min_std", None)  # weights of before hold it; it is a setting
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation, each ``[*B, A]``."""

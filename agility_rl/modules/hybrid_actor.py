@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -175,7 +176,7 @@ class HybridNetwork(nn.Module):
             if not allowed or not set(allowed) <= set(range(num_choices)):
                 raise ValueError(f"allowed must name choices 0 to {num_choices - 1}, got {tuple(allowed)}")
             mask[[index for index in range(num_choices) if index not in allowed]] = FORBIDDEN
-        self.register_buffer("mask", mask)
+        self.register_buffer("mask", mask, persistent=False)
         self.continuous_shape = tuple(continuous_shape)
         num_continuous = math.prod(self.continuous_shape)
         floor = torch.as_tensor(min_std).expand(self.continuous_shape).flatten()
@@ -184,6 +185,10 @@ class HybridNetwork(nn.Module):
         self.parameters_head = GaussianNetwork(
             mlp(num_features, (), num_continuous), num_continuous, initial_std, floor
         )
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        state_dict.pop(f"{prefix}mask", None)  # weights of before hold it; it is a setting
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return logits ``[*B, K]``, mean and standard deviation, each ``[*B, *continuous_shape]``."""

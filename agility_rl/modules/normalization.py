@@ -52,7 +52,8 @@ class FeatureNormalizer(nn.Module):
         epsilon: float = 1e-4,
     ) -> None:
         super().__init__()
-        mean, std = torch.as_tensor(mean).detach().clone(), torch.as_tensor(std).detach().clone()
+        dtype = torch.get_default_dtype()
+        mean, std = (torch.as_tensor(x, dtype=dtype).detach().clone() for x in (mean, std))
         if mean.ndim != 1 or mean.shape != std.shape:
             raise ValueError(
                 f"mean and std must be vectors of one length, got {list(mean.shape)} and {list(std.shape)}"

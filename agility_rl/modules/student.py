@@ -193,6 +193,7 @@ class RecurrentStudent(nn.Module):
         return TensorDictSequential(
             *([] if seen else [self.depth_encoder]),
             self.estimator,
+            TensorDictModule(Tensor.detach, [keys.ESTIMATE], [keys.ESTIMATE]),  # imitation does not bend measurements
             TensorDictModule(
                 remember,
                 in_keys=[keys.DEPTH_FEATURE, *measured, keys.HIDDEN, "is_init", *start],

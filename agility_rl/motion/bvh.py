@@ -6,6 +6,7 @@ order of rotation channels; a root with position channels takes its position fro
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,7 +95,7 @@ def forward(skeleton: Skeleton, values: Tensor) -> Tensor:
 
     .. math:: R_j = R_{p(j)} \\prod_k R_{axis_k}(\\theta_k), \\quad x_j = x_{p(j)} + R_{p(j)} o_j
 
-    with the rotations multiplied in the order of the channels. A joint with position channels stands at their values.
+    with the rotations multiplied in the order of the channels. Position channels take the place of the offset o.
 
     Args:
         skeleton: hierarchy of ``P`` joints.
@@ -115,10 +116,8 @@ def forward(skeleton: Skeleton, values: Tensor) -> Tensor:
     turns: list[Tensor] = []
     column = 0
     for joint, (parent, channels) in enumerate(zip(skeleton.parents, skeleton.channels, strict=True)):
-        turn = torch.eye(3, dtype=values.dtype).expand(*batch, 3, 3) if parent < 0 else turns[parent]
-        position = offsets[joint].expand(*batch, 3)
-        if parent >= 0:
-            position = positions[parent] + (turn @ offsets[joint])
+        around = torch.eye(3, dtype=values.dtype).expand(*batch, 3, 3) if parent < 0 else turns[parent]
+        turn = around
         placed: dict[int, Tensor] = {}
         for channel in channels:
             axis, value = _AXES[channel[0]], values[..., column]
@@ -127,9 +126,11 @@ def forward(skeleton: Skeleton, values: Tensor) -> Tensor:
             else:
                 turn = turn @ _axis_rotation(axis, torch.deg2rad(value))
             column += 1
+        offset = offsets[joint].expand(*batch, 3)
         if placed:
-            position = torch.stack([placed.get(axis, position[..., axis]) for axis in range(3)], -1)
-        positions.append(position)
+            offset = torch.stack([placed.get(axis, offset[..., axis]) for axis in range(3)], -1)
+        position = (around @ offset[..., None])[..., 0]
+        positions.append(position if parent < 0 else positions[parent] + position)
         turns.append(turn)
     return torch.stack(positions, -2)
 
@@ -162,8 +163,8 @@ def _parse_hierarchy(lines: list[str], path: Path) -> tuple[Skeleton, int]:
         match words[0]:
             case "ROOT" | "JOINT" | "End":
                 parent = stack[-1] if stack else -1
-                if words[0] == "ROOT" and names:
-                    raise MotionError(f"{where}: expected one hierarchy, found a second ROOT")
+                if (words[0] == "ROOT") == bool(names):
+                    raise MotionError(f"{where}: expected one hierarchy, its ROOT first, got {line.strip()!r}")
                 names.append(f"{names[parent]}_End" if words[0] == "End" else words[-1])
                 parents.append(parent)
             case "{":
@@ -177,7 +178,7 @@ def _parse_hierarchy(lines: list[str], path: Path) -> tuple[Skeleton, int]:
             case "CHANNELS":
                 declared = tuple(words[2:])
                 known = all(word[:1] in _AXES and word[1:] in ("position", "rotation") for word in declared)
-                if not known or words[1] != str(len(declared)):
+                if not known or words[1:2] != [str(len(declared))]:
                     raise MotionError(f"{where}: expected a number of channels and their names, got {line.strip()!r}")
                 channels[len(names) - 1] = declared
             case "MOTION":
@@ -193,12 +194,13 @@ def _parse_hierarchy(lines: list[str], path: Path) -> tuple[Skeleton, int]:
 
 def _parse_motion(lines: list[str], line: int, skeleton: Skeleton, path: Path) -> tuple[float, Tensor]:
     """Seconds between frames and values ``[T, C]``, float64."""
-    header = [entry.split(":", 1) for entry in lines[line : line + 2]]
-    if len(header) != 2 or header[0][0].strip() != "Frames" or header[1][0].strip() != "Frame Time":
+    header = [entry.partition(":") for entry in lines[line : line + 2]]
+    if [(name.strip(), colon) for name, colon, _ in header] != [("Frames", ":"), ("Frame Time", ":")]:
         raise MotionError(f"{path}, line {line + 1}: expected 'Frames:' and 'Frame Time:' after MOTION")
-    frames = int(_numbers(header[0][1].split(), 1, f"{path}, line {line + 1}")[0])
-    dt = _numbers(header[1][1].split(), 1, f"{path}, line {line + 2}")[0]
-    if dt <= 0:
+    announced = _numbers(header[0][2].split(), 1, f"{path}, line {line + 1}")[0]
+    frames = int(announced) if math.isfinite(announced) else -1
+    dt = _numbers(header[1][2].split(), 1, f"{path}, line {line + 2}")[0]
+    if not 0 < dt < math.inf:
         raise MotionError(f"{path}, line {line + 2}: expected a positive frame time in seconds, got {dt}")
     rows = [
         _numbers(text.split(), skeleton.num_channels, f"{path}, line {number}")

@@ -6,6 +6,8 @@ Joints FL, FR, RL, RR x (hip, thigh, calf), feet FL, FR, RL, RR, quaternions ``(
 from __future__ import annotations
 
 import math
+import zipfile
+import zlib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -242,7 +244,8 @@ def save(clip: MotionClip, path: str | Path) -> Path:
     Returns:
         The path written, which ends in ``.npz``.
     """
-    path = Path(path).with_suffix(".npz")
+    path = Path(path)
+    path = path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")  # walk_0.3 has no suffix
     arrays = {name: getattr(clip, name).numpy() for name in _SHAPES}
     scalars = {
         f.name: np.asarray(getattr(clip, f.name) or "") for f in fields(clip) if f.name in ("name", "label", "source")
@@ -269,20 +272,24 @@ def load(path: str | Path) -> MotionClip:
     """
     path = Path(path)
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             data = {key: archive[key] for key in archive.files}
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
         raise MotionError(f"{path}: expected an .npz archive of a clip, got {error}") from error
     missing = sorted({*_SHAPES, "name", "dt"} - data.keys())
     if missing:
         raise MotionError(f"{path}: expected the arrays of a clip, {', '.join(missing)} missing; write it with save()")
-    return MotionClip(
-        name=str(data["name"]),
-        dt=float(data["dt"]),
-        label=str(data.get("label", "")) or None,
-        weight=float(data.get("weight", 1.0)),
-        source=str(data.get("source", "npz")),
-        synthetic=bool(data.get("synthetic", False)),
-        notes=tuple(str(note) for note in data.get("notes", ())),
-        **{name: torch.from_numpy(data[name]) for name in _SHAPES},
-    )
+    try:
+        arrays = {name: torch.from_numpy(data[name]) for name in _SHAPES}
+        return MotionClip(
+            name=str(data["name"]),
+            dt=float(data["dt"]),
+            label=str(data.get("label", "")) or None,
+            weight=float(data.get("weight", 1.0)),
+            source=str(data.get("source", "npz")),
+            synthetic=bool(data.get("synthetic", False)),
+            notes=tuple(str(note) for note in data.get("notes", ())),
+            **{name: array.float() if array.is_floating_point() else array for name, array in arrays.items()},
+        )
+    except TypeError as error:
+        raise MotionError(f"{path}: expected numbers in the arrays of a clip, got {error}") from error

@@ -41,7 +41,7 @@ def read_frames(path: str | Path) -> tuple[float, Tensor]:
     try:
         frames = torch.tensor(rows, dtype=torch.float64)
         duration = float(data["FrameDuration"])
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise MotionError(f"{path}: expected numbers in 'Frames' and 'FrameDuration', got {error}") from error
     finite = torch.isfinite(frames)
     if not bool(finite.all()):

@@ -274,12 +274,17 @@ def read_scalars(path: str | Path) -> dict[str, tuple[Tensor, Tensor]]:
         agility_rl.record.messages.DamageError: if the file is no MCAP or damaged in the middle.
     """
     rows: dict[str, list[tuple[int, float, int]]] = {}
-    first: dict[int, int] = {}
+    first: dict[int, int] = {}  # step that a session did again first
+    before: dict[tuple[str, int], int] = {}  # last step of a name before a session
     for record in read_messages(_file(path)):
         if record.schema == Scalar.DESCRIPTOR.full_name:
-            step, session = record.value.step, record.value.session
-            rows.setdefault(record.topic[1:], []).append((step, record.value.value, session))
-            first[session] = min(first.get(session, step), step)
+            name, step, session = record.topic[1:], record.value.step, record.value.session
+            entries = rows.setdefault(name, [])
+            if (name, session) not in before:
+                before[name, session] = max((entry[0] for entry in entries), default=-1)
+            if step <= before[name, session]:  # not of a name that a session begins or goes on with
+                first[session] = min(first.get(session, step), step)
+            entries.append((step, record.value.value, session))
     result = {}
     for name, entries in rows.items():
         kept = [e for e in entries if all(e[0] < start for session, start in first.items() if session > e[2])]

@@ -144,6 +144,10 @@ class Simulator(Protocol):
         """Change parameters of :data:`PARAMETERS` in the rows of a bool mask; each value is ``[N, size]``."""
         ...
 
+    def parameter(self, name: str) -> Tensor:
+        """Present value ``[N, size]`` of a parameter, as a copy."""
+        ...
+
     def push(self, mask: Tensor, velocity: Tensor) -> None:
         """Set the horizontal trunk velocity ``[N, 2]`` [m/s] of the rows of a bool mask."""
         ...

@@ -22,6 +22,8 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, 
 
 PREFIX = "checkpoint"
 SUFFIX = ".torchrl"
+LEFT = ".left"
+"""Added to the names of checkpoints of a branch that was left."""
 _RANDOM = "global_random_state"
 _STAGING = ".staging"
 
@@ -87,6 +89,8 @@ class RunCheckpoint:
     def save(self, step: int, metadata: Mapping[str, Any] | None = None) -> Path:
         """Write a checkpoint, make it durable, then drop the ones that rotation no longer keeps.
 
+        Those of later steps, which are there if an earlier one was loaded, are set aside as ``*.left``.
+
         Args:
             step: number of finished iterations; names the file.
             metadata: JSON values stored beside, such as the metric that ``keep_best`` looks at.
@@ -104,6 +108,9 @@ class RunCheckpoint:
         destination = self.directory / f"{PREFIX}-{step:012d}{SUFFIX}"
         publish(staged, destination)
         shutil.rmtree(staging, ignore_errors=True)
+        for path in _files(self.directory):
+            if step_of(path) > step:  # of a branch that was left by going back; else that would be resumed
+                path.replace(path.with_name(path.name + LEFT))
         self._rotation.prune()
         return destination
 
@@ -273,7 +280,8 @@ class _TensorState:
         here, there = set(self.value.keys(True, True)), set(saved.keys(True, True))
         if here != there:
             raise ValueError(f"expected the keys {sorted(map(str, here))}, got {sorted(map(str, there))}")
-        self.value.update_(saved)
+        for key in here:
+            _copy(str(key), self.value.get(key), saved.get(key))
 
 
 class _MappingState:

@@ -32,6 +32,8 @@ from agility_rl.training.checkpoint import publish
 C = TypeVar("C")
 CONFIG_FILE = "config.json"
 CONFIG_VERSION = 1
+STOPS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
+"""Signals that end a loop after its present iteration."""
 _PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "numpy")
 
 
@@ -95,7 +97,7 @@ def one_line_errors() -> Iterator[None]:
     """Turn the errors that a user can mend into one line and status 2; defects keep their traceback.
 
     Mendable are wrong values (``ValueError``, which motion and artifact errors are), files that are missing, present or
-    unreadable (``OSError``), and checkpoints that cannot be read.
+    unreadable (``OSError``), packages that are not installed, and checkpoints that cannot be read.
 
     Example:
         >>> with contextlib.suppress(SystemExit), one_line_errors():
@@ -103,7 +105,7 @@ def one_line_errors() -> Iterator[None]:
     """
     try:
         yield
-    except (ValueError, OSError, CheckpointError) as error:
+    except (ValueError, OSError, ImportError, CheckpointError) as error:
         _stop(" ".join(str(error).split()))
 
 
@@ -123,6 +125,8 @@ def console(width: int) -> Console:
 def interruptible() -> Iterator[Callable[[], bool]]:
     """Let Ctrl-C end a loop after its present iteration, so that what is saved then is exact; twice stops at once.
 
+    So do the signals of ``kill``, of a scheduler whose time is up and of a terminal that is closed.
+
     Example:
         >>> with interruptible() as interrupted:
         ...     interrupted()
@@ -135,13 +139,17 @@ def interruptible() -> Iterator[Callable[[], bool]]:
         requests += 1
         if requests > 1:
             raise KeyboardInterrupt
-        sys.stderr.write("stopping after this iteration; press Ctrl-C again to stop at once\n")
+        with contextlib.suppress(OSError):  # a terminal that is closed takes no words
+            sys.stderr.write("stopping after this iteration; press Ctrl-C again to stop at once\n")
 
-    previous = signal.signal(signal.SIGINT, request)
+    # Who began the program with nohup wants it to outlive its terminal.
+    numbers = [number for number in STOPS if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN]
+    previous = {number: signal.signal(number, request) for number in numbers}
     try:
         yield lambda: requests > 0
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def start_run(config: Any, folder: str | Path, *, resume: bool = False, **extra: Any) -> Path:

@@ -118,7 +118,7 @@ class PPOUpdate:
         """Update on a batch ``[T, N]`` that holds ``advantage`` and ``value_target``.
 
         Args:
-            batch: collected experience with advantages.
+            batch: collected experience with advantages, which are normalised in it.
             generator: source of the minibatch order.
             extra: another loss of a minibatch, added to PPO's.
             critic_only: leave the policy and the learning rate as they are: a fresh critic would mislead a good policy.
@@ -128,7 +128,8 @@ class PPOUpdate:
         """
         batch["advantage"] = self._normalized(batch)
         names = dict.fromkeys((*self.loss.in_keys, "advantage", "value_target", *self.keep))
-        flat = batch.select(*(name for name in names if "next" not in name), strict=False).flatten()
+        present = (name for name in names if (name if isinstance(name, str) else name[0]) != "next")
+        flat = batch.select(*present, strict=False).flatten()
         size = flat.numel() // self.minibatches
         if size < 1:
             raise ValueError(f"expected at least {self.minibatches} samples, one a minibatch, got {flat.numel()}")

@@ -70,6 +70,7 @@ class Seeds:
         """Position of every stream handed out so far."""
         return {
             "seed": self.seed,
+            "rank": self.rank,
             "torch": {name: generator.get_state() for name, generator in self._torch.items()},
             # A PCG64 state holds 128-bit integers, which JSON keeps exactly and tensors cannot.
             "numpy": {name: generator.bit_generator.state for name, generator in self._numpy.items()},
@@ -79,16 +80,20 @@ class Seeds:
         """Put every stream back where :meth:`state_dict` found it, in the generators already handed out.
 
         Raises:
-            ValueError: if the state belongs to another seed.
+            ValueError: if the state belongs to another seed, or to another process.
         """
         if state["seed"] != self.seed:
             raise ValueError(
                 f"the run was started with seed {state['seed']}, got seed {self.seed}; resume with its own"
             )
-        for name, value in state["torch"].items():
-            self.generator(name).set_state(value.cpu())
-        for name, value in state["numpy"].items():
-            self.numpy(name).bit_generator.state = value
+        if state.get("rank", self.rank) != self.rank:  # states of before do not say it
+            raise ValueError(f"these are the streams of process {state['rank']}, expected those of {self.rank}")
+        for name in {*self._torch, *state["torch"]}:  # who had drawn nothing yet is at its beginning
+            fresh = torch.Generator(self.device).manual_seed(self.integer(name)).get_state()
+            self.generator(name).set_state(state["torch"].get(name, fresh).cpu())
+        for name in {*self._numpy, *state["numpy"]}:
+            fresh_bits = np.random.PCG64(self.integer(name)).state
+            self.numpy(name).bit_generator.state = state["numpy"].get(name, fresh_bits)
 
 
 def permutation(number: int, generator: torch.Generator) -> Tensor:

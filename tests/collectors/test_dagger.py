@@ -9,6 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import InteractionType, set_interaction_type
+from torchrl.envs import StepCounter, TransformedEnv
 
 from agility_rl import keys
 from agility_rl.collectors import DAggerCollector
@@ -146,3 +147,19 @@ def test_the_first_robots_may_be_led(env: AgilityEnv, student: RecurrentStudent,
     collect.led = 0
     window = collect.collect()
     assert not torch.equal(window[keys.ACTION, keys.PARAMETERS][:, 0], window[keys.LABEL, keys.PARAMETERS][:, 0])
+
+
+def test_an_environment_that_counts_in_its_transforms(student: RecurrentStudent, teacher: Teacher) -> None:
+    counted = TransformedEnv(make_env(episode_length=40.0), StepCounter())
+    window = collector(counted, student, teacher, keep_next=["step_count"]).collect()
+    assert window["next", "step_count"][:, 0, 0].tolist() == [1, 2, 3, 4, 5]
+    counted.close()
+
+
+def test_means_that_are_kept_are_the_students_own(env: AgilityEnv, student: RecurrentStudent, teacher: Teacher) -> None:
+    collect = collector(env, student, teacher, keep_written=["loc"])
+    collect.led = 1
+    window = collect.collect()
+    parameters, label = window[keys.ACTION, keys.PARAMETERS], window[keys.LABEL, keys.PARAMETERS]
+    assert torch.equal(window["loc"][:, 1:], parameters[:, 1:])
+    assert torch.equal(parameters[:, 0], label[:, 0]) and not torch.equal(window["loc"][:, 0], label[:, 0])

@@ -96,6 +96,24 @@ def test_a_robot_that_is_not_fit_does_not_stand_up(controller: Controller, bus: 
     assert controller.step().mode is Mode.PASSIVE and "never arrived" in controller.events[-1].reason
 
 
+def test_whoever_was_never_driven_is_left_to_another_program(controller: Controller, bus: FakeBus) -> None:
+    bus.others = ("sport mode",)
+    controller.run(seconds=0.1)
+    assert controller.mode is Mode.PASSIVE and not bus.sent
+    bus.others = ()
+    controller.run(seconds=0.1)
+    assert controller.mode is Mode.DAMPING and is_damping(bus.sent[-1])
+
+
+def test_a_stop_is_not_undone_by_what_is_asked_for_after_it(running: Running) -> None:
+    controller = running()
+    controller.request(Mode.DAMPING)
+    controller.request(Mode.STAND_UP)
+    assert controller.step().mode is Mode.DAMPING
+    controller.request(Mode.PASSIVE)
+    assert controller.step().mode is Mode.PASSIVE
+
+
 def test_a_run_begins_only_from_the_default_pose(controller: Controller, bus: FakeBus, running: Running) -> None:
     controller.request(Mode.STAND_UP)
     while controller.mode is not Mode.READY:

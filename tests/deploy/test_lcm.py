@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
@@ -66,6 +67,20 @@ def test_states_come_and_commands_arrive(robot: LCMRobot, url: str) -> None:
     assert robot.robot.data.ctrl.tolist() == list(range(12)), "our joints, in our order"
     assert transport.other_commanders() == () and robot.refused.count == transport.refused.count == 0
     transport.close()
+    transport.close()
+
+
+def test_the_last_word_of_a_silent_robot_grows_old_though_it_is_repeated(robot: LCMRobot, url: str) -> None:
+    transport = LCMTransport(url, patience=60.0)
+    last = replace(transport.read(), sequence=10**6)
+    repeater = connect(url)
+    message = pack_state(last, robot.name)
+    assert until(lambda: repeater.publish(STATE_CHANNEL, message) or transport.read().sequence == 10**6)
+    heard = transport.read().time
+    for _ in range(5):
+        repeater.publish(STATE_CHANNEL, message)
+        time.sleep(0.02)
+        assert transport.read().time == heard
     transport.close()
 
 

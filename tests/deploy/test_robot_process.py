@@ -94,5 +94,5 @@ def test_the_process_runs_in_real_time_and_dies_with_its_parent() -> None:
 
 
 def test_a_process_that_cannot_begin_says_so() -> None:
-    with pytest.raises(RuntimeError, match="ended with status 1 before it began"):
+    with pytest.raises(ConnectionError, match="ended with status 1 before it began"):
         RobotProcess(pose="sitting")

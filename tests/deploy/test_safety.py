@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -48,6 +49,7 @@ def test_a_standing_robot_is_fine() -> None:
         ({"trunk_position": torch.tensor([0.0, 0.0, float("nan")])}, "not a number", r"trunk_position\[2\]"),
         ({"joint_position": joints(2, 0.0)}, "joint limits", "joint 2 is at 0.00 rad, its stops are -2.72 and -0.84"),
         ({"joint_position": joints(3, -1.4)}, "joint limits", "joint 3 is at -1.40 rad"),
+        ({"quaternion": torch.zeros(4)}, "orientation", "the quaternion has length 0.00, expected 1"),
         ({"quaternion": lean(roll=1.3)}, "tilt", "leans by 1.30 rad, expected at most 1.20"),
         ({"quaternion": lean(pitch=-1.3)}, "tilt", "leans by 1.30 rad"),
         ({"quaternion": lean(roll=1.0, pitch=1.0)}, "tilt", "the trunk leans"),
@@ -100,6 +102,9 @@ def test_ages() -> None:
     assert checks.check_loop(1.0, {"operator": 0.4}, 0).check == "lost operator"
     stale_depth = checks.check_loop(1.0, {"operator": 1.0, "depth": 0.7}, 0)
     assert stale_depth.check == "stale depth" and "is 300 ms old, expected at most 200 ms" in stale_depth.reason
+    assert checks.check_loop(1.0, {"operator": 1.3, "depth": math.inf}, 0) is None
+    other_clock = checks.check_loop(1.0, {"operator": 1.0, "depth": 1.7e9}, 0)
+    assert other_clock.check == "stale depth" and "dated 1.7e+09 s ahead, expected a time of" in other_clock.reason
     with pytest.raises(KeyError, match="lidar"):
         checks.check_loop(1.0, {"lidar": 1.0}, 0)
 

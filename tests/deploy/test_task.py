@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -152,8 +153,14 @@ def test_a_camera_that_stops_or_is_covered_ends_in_damping(
 ) -> None:
     for spoil, fault in (
         (lambda camera: None, "stale depth: the last word of the source 'depth' is"),
-        (lambda camera: setattr(camera, "frame", Frame(1e9, np.zeros((480, 848), np.uint16))), "no pixel of the depth"),
-        (lambda camera: setattr(camera, "frame", Frame(1e9, np.ones((848, 480), np.uint16))), "columns are swapped"),
+        (
+            lambda camera: setattr(camera, "frame", Frame(math.inf, np.zeros((480, 848), np.uint16))),
+            "no pixel of the depth",
+        ),
+        (
+            lambda camera: setattr(camera, "frame", Frame(math.inf, np.ones((848, 480), np.uint16))),
+            "columns are swapped",
+        ),
     ):
         clock, camera = ManualClock(), Camera()
         camera.frame = Frame(0.0, np.full((480, 848), 2000, np.uint16))

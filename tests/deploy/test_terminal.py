@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import pty
@@ -15,6 +16,7 @@ import pytest
 from agility_rl.deploy.controller import Mode
 from agility_rl.deploy.operator import Device, Status, Stick
 from agility_rl.deploy.terminal import SHOW_EVERY, TerminalDevice, keys_in
+from tests.waiting import until
 
 
 @pytest.fixture
@@ -93,10 +95,30 @@ def test_the_state_is_one_line_no_wider_than_the_terminal(line: tuple[int, TextI
     device = TerminalDevice(program, screen)
     for number in range(2 * SHOW_EVERY):
         device.show(Status(Mode.RUN, "trot", "policy", (0.1 * number, 0.0, 0.0), (0.0, 0.0, 0.0), "requested"))
-    written = screen.getvalue().split("\r\x1b[K")[1:]
+        until(device._lines.empty)
+    device.close()
+    written = screen.getvalue().rstrip("\n").split("\r\x1b[K")[1:]
     assert len(written) == 2 and all(len(text) <= 49 and "\n" not in text for text in written)
     assert written[0].startswith("run: trot commanded +0.00 m/s") or written[0].startswith("run: trot  commanded")
-    device.close()
+
+
+def test_a_screen_that_takes_nothing_holds_nobody_up(line: tuple[int, TextIO]) -> None:
+    person, program = line
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(write, bytes(4096))
+    os.set_blocking(write, True)
+    with os.fdopen(read, "rb"), os.fdopen(write, "w") as screen:
+        device = TerminalDevice(program, screen)
+        for _ in range(10 * SHOW_EVERY):
+            device.show(Status(Mode.RUN))  # would never return if it waited for the screen
+        os.write(person, b"\x13\x1a\x1b")  # Ctrl-S and Ctrl-Z are mere bytes, and Escape is heard
+        assert until(lambda: "escape" in device.read())
+        device.close()
+        os.read(read, 1 << 20)
+        device._writer.join()
 
 
 def test_a_person_who_hangs_up_is_gone() -> None:

@@ -50,6 +50,7 @@ CASES: list[tuple[str, dict[str, Any], float]] = [
     ("turn_progress", {"command": TURN, "mean_yaw_rate": torch.tensor([-1.0])}, 0.8),
     ("turn_progress", {"command": TURN, "mean_yaw_rate": torch.tensor([4.0])}, -1.0),
     ("velocity_progress", {"command": 0.0 * COMMAND}, 1.0),
+    ("velocity_progress", {"command": 0.0 * COMMAND, "mean_velocity": torch.tensor([[0.03, -0.04, 9.0]])}, 0.5),
     ("low_feet", {"low_feet": torch.tensor([0.17])}, 0.17),
     ("lateral_progress", {"command": COMMAND, "mean_velocity": torch.tensor([[9.0, 0.05, 9.0]])}, 0.5),
     ("lateral_progress", {"command": COMMAND, "mean_velocity": torch.tensor([[1.0, -0.7, 0.0]])}, -1.0),

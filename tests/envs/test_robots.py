@@ -75,6 +75,13 @@ def test_randomising_some_leaves_the_others() -> None:
     torch.testing.assert_close(robots.privileged[:, 5:17], robots.stiffness / 40.0 - 1.0)
 
 
+def test_parameters_of_the_simulator_are_those_that_rewards_and_critics_are_told() -> None:
+    simulator = make_simulator(num_simulations=2, num_threads=1, stiffness=20.0, ground_friction=0.5)
+    robots = Robots(simulator, torch.Generator())
+    assert robots.stiffness.unique().tolist() == [20.0] and robots.damping.unique().tolist() == [1.0]
+    assert robots.privileged[0, 4].item() == 0.5 and robots.privileged[0, 5:17].unique().tolist() == [-0.5]
+
+
 def test_memories_are_saved() -> None:
     robots, commands = build(2)
     robots.step(torch.ones(2, 12))

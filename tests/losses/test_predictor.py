@@ -183,6 +183,26 @@ def test_batches_of_any_shape_sums_and_masks() -> None:
     torch.testing.assert_close(masked, PredictorLoss(net)(td)["loss_skill"])
 
 
+def test_what_does_not_count_is_in_no_number() -> None:
+    net, td = network(), batch()
+    for group in ("labelled", "policy", "unlabelled"):
+        counting = torch.arange(td[group].numel()) % 2 == 0
+        td[group, "collector", "mask"] = counting
+    some, alone = TensorDict(), TensorDict()
+    for group in ("labelled", "policy", "unlabelled"):
+        some[group], alone[group] = td[group], td[group][::2].exclude("collector")
+    loss = PredictorLoss(net, marginal=0.5)
+    for name, value in loss(alone).items():
+        torch.testing.assert_close(loss(some)[name], value, msg=name)
+
+
+def test_a_target_of_another_shape_is_refused_not_broadcast() -> None:
+    td = batch()
+    td["policy", "shift"] = td["policy", "shift"].squeeze(-1)
+    with pytest.raises(ValueError, match=r"expected 'shift' of shape \[6, 1\], as it is estimated, got \[6\]"):
+        PredictorLoss(network())(td)
+
+
 def test_the_probability_feeds_the_prior() -> None:
     prior = SkillPrior(K, decay=0.0)
     losses = PredictorLoss(network())(batch())

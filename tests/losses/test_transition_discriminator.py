@@ -130,6 +130,10 @@ def test_masked_transitions_do_not_count() -> None:
         masked, alone = loss(whole), loss(cut)
         for name in loss.out_keys:
             torch.testing.assert_close(masked[name], alone[name])
+    mask = rollout["collector", "mask"]
+    spoilt = rollout.exclude("collector").masked_fill(~mask, torch.nan).set("collector", rollout["collector"])
+    total(loss(TensorDict({"expert": cut["expert"], "policy": spoilt}))).backward()
+    assert all(weight.grad.isfinite().all() for weight in net.parameters() if weight.grad is not None)
 
 
 def test_nested_keys() -> None:

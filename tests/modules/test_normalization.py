@@ -43,3 +43,11 @@ def test_errors() -> None:
         FeatureNormalizer([float("nan")], [1.0])
     with pytest.raises(ValueError, match=r"shape \[2\], got \[1\]"):
         FeatureNormalizer(torch.zeros(2), torch.ones(2)).set_weight([1.0])
+
+
+def test_statistics_of_any_numbers_become_floats() -> None:
+    whole = FeatureNormalizer([0, 0], [1, 2])
+    whole.set_weight([0.5, 1.0])
+    assert whole.weight.tolist() == [0.5, 1.0]
+    double = FeatureNormalizer(torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64))
+    assert double(torch.ones(1, 2)).dtype == torch.float32

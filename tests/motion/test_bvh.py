@@ -56,6 +56,19 @@ def test_positions_of_a_small_skeleton(small: Path) -> None:
     torch.testing.assert_close(position[1], expected)
 
 
+def test_position_channels_of_a_joint_lie_in_its_parents_frame(small: Path) -> None:
+    text = SMALL.replace("CHANNELS 3 Zrot", "CHANNELS 6 Xposition Yposition Zposition Zrot")
+    text = text.replace("300 0 0 0 0 0 0", "300 0 0 0 10 0 0 0 0 0").replace(
+        "300 90 0 0 0 90 0", "300 90 0 0 12 0 0 0 90 0"
+    )
+    small.write_text(text)
+    motion = read_bvh(small)
+    position = forward(motion.skeleton, motion.values)
+    # As above, but the leg of frame 1 is 12 long, along the y that x has become.
+    expected = torch.tensor([[100.0, 200, 300], [100, 212, 300], [100, 212, 320]], dtype=torch.float64)
+    torch.testing.assert_close(position[1], expected)
+
+
 def test_keypoints_are_metres_with_z_up(small: Path) -> None:
     points = read_bvh(small).keypoints()
     torch.testing.assert_close(points.point("Leg_End")[0], torch.tensor([1.1, -3.0, 2.2], dtype=torch.float64))
@@ -110,6 +123,10 @@ def test_a_recording_becomes_a_clip(data: Path) -> None:
         ("100 200 300 90 0 0 0 90 0", "100 200 300 90 0 0 0 90 nan", "NaN or infinity, first in frame 1 of 2"),
         ("OFFSET 10 0 0", "OFFSET 10 0", "line 8: expected 3 numbers, got 2"),
         ("3 Zrotation Xrotation Yrotation", "3 Zrotation Xrotation Wrotation", "line 9: expected a number of channels"),
+        ("3 Zrotation Xrotation Yrotation", "", "line 9: expected a number of channels"),
+        ("ROOT Hips", "End Site", "line 2: expected one hierarchy, its ROOT first, got 'End Site'"),
+        ("Frames:	2", "Frames", "line 17: expected 'Frames:' and 'Frame Time:'"),
+        ("Frames:	2", "Frames:	nan", "expected -1 frames"),
         ("0.0166667", "0", "positive frame time"),
         ("  }\n}\n", "  }\n", "the hierarchy is incomplete"),
         ("JOINT Leg", "BONE Leg", "'BONE' is no BVH keyword"),

@@ -80,6 +80,34 @@ def test_an_incomplete_archive_names_what_is_missing(tmp_path: Path) -> None:
         load(path)
 
 
+def test_a_damaged_archive_is_one_clear_error(make_clip: Callable[..., MotionClip], tmp_path: Path) -> None:
+    whole = save(make_clip(), tmp_path / "clip.npz").read_bytes()
+    path = tmp_path / "damaged.npz"
+    spoilt = bytearray(whole)
+    spoilt[len(whole) // 2 : len(whole) // 2 + 64] = bytes(64)
+    for content in (whole[: len(whole) // 2], bytes(spoilt)):
+        path.write_bytes(content)
+        with pytest.raises(MotionError, match=r"damaged.npz: expected an .npz archive"):
+            load(path)
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    path.write_bytes((tmp_path / "array.npy").read_bytes())
+    with pytest.raises(MotionError, match=r"damaged.npz"):
+        load(path)
+
+
+def test_arrays_of_another_precision_become_ours(make_clip: Callable[..., MotionClip], tmp_path: Path) -> None:
+    path = save(make_clip(), tmp_path / "clip.npz")
+    with np.load(path) as archive:
+        doubled = {name: x.astype(np.float64) if x.dtype == np.float32 else x for name, x in archive.items()}
+    np.savez(path, **doubled)
+    assert load(path).joint_position.dtype == torch.float32
+
+
+def test_a_point_in_a_name_is_no_suffix(make_clip: Callable[..., MotionClip], tmp_path: Path) -> None:
+    files = [save(make_clip(), tmp_path / name) for name in ("walk_0.3", "walk_0.6", "walk_0.6.npz")]
+    assert [file.name for file in files] == ["walk_0.3.npz", "walk_0.6.npz", "walk_0.6.npz"]
+
+
 def test_nan_is_refused_with_its_frame(make_clip: Callable[..., MotionClip]) -> None:
     clip = make_clip()
     joints = clip.joint_velocity.clone()

@@ -150,6 +150,7 @@ def test_an_option_of_another_transport_is_named(deploy: ModuleType, untrained: 
         ({"ttl": 1, "transport": "lcm", "simulator": tmp_path}, "--simulator only with a simulated robot, got a real"),
         ({"ttl": 1, "transport": "lcm", "course": "full"}, "--course only with a simulated robot, got a real"),
         ({"course": "full", "world": tmp_path}, "expected --course or --world, got both"),
+        ({"ttl": 1, "transport": "lcm"}, "a script makes a real robot stand up and run at once: give --operator"),
     ):
         with pytest.raises(ValueError, match=message):
             deploy.main(deploy.Config(untrained, output=tmp_path / "run.mcap", **options))
@@ -175,6 +176,9 @@ def test_a_file_is_never_overwritten_and_a_bad_name_is_named(
         with pytest.raises(ValueError, match=r"a new file that ends in \.mcap"):
             deploy.main(deploy.Config(untrained, output=path))
     assert taken.read_bytes() == b"mine"
+    (tmp_path / "deploy_0.mcap").touch()
+    (tmp_path / ".deploy_1.mcap.incoming").touch()
+    assert deploy.free_file(tmp_path).name == "deploy_2.mcap", "a killed run's recording is left alone"
     with pytest.raises(ValueError, match="'gallop' is no behaviour"):
         deploy.main(deploy.Config(untrained, skill="gallop"))
 

@@ -215,7 +215,9 @@ def test_a_gamepad_beside_a_page(module: Module) -> None:
     assert (held.shown, seen.shown) == (0, 1)
     seen.there = False
     assert both.connected() and both.ended(), "steered without being seen, until the loop ends"
-    held.there, seen.there = False, True
+    held.there, seen.there, held.entries, seen.entries = False, True, [], ["up"]
+    assert list(both.read()) == ["up", "escape"], "pulled out, its sticks would stay where they were"
+    assert list(both.read()) == ["up"]
     assert both.connected() and not both.ended(), "the page's keys are left"
     both.close()
     assert not held.there and not seen.there

@@ -13,7 +13,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from agility_rl.behaviours import command_bounds, commands_from_parameters
+from agility_rl.behaviours import BEHAVIOURS, command_bounds, commands_from_parameters
 from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.envs.misjudgement import LASTING
 from agility_rl.envs.obstacles import OBSTACLES
@@ -123,8 +123,12 @@ def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
     wide = recipe.train(replace(smoke, name="wide", iterations=0, init_from=parent, ppo=broad))
     head = "actor.module.0.module.parameters_head."
     started = Artifact.load(wide / "policy").state  # the parent's floor was 0.15, its deviation 0.2
-    for name in ("min_std", "std"):
-        assert started[head + name].tolist() == pytest.approx([0.4] * 30), name
+    assert started[head + "std"].tolist() == pytest.approx([0.4] * 30)
+    parts = recipe.build(replace(smoke, init_from=parent, ppo=broad, behaviours=("trot",)))
+    recipe.begin(parts, replace(smoke, init_from=parent, ppo=broad, behaviours=("trot",)))
+    assert parts.teacher.actor.network.parameters_head.min_std.tolist() == pytest.approx([0.4] * 30)
+    assert (parts.teacher.actor.network.mask == 0.0).tolist() == [name == "trot" for name in BEHAVIOURS]
+    parts.env.close()
     script, box = replace(smoke.cloning, script="trot:1.2"), replace(smoke.env, course="box")
     alone = recipe.train(replace(smoke, name="trot", behaviours=("trot",), cloning=script, env=box, iterations=1))
     scalars = read_scalars(alone)

@@ -118,6 +118,24 @@ def test_resume_continues_the_same_file_and_replaces_what_is_run_again(tmp_path:
     assert sum(1 for _ in read_messages(third.path)) == 11, "the superseded values are still in the file"
 
 
+def test_a_resumed_run_may_log_what_has_steps_of_its_own(tmp_path: Path) -> None:
+    with_steps = MCAPLogger("run", tmp_path)
+    for step in range(100):
+        with_steps.log_scalar("loss", 0.1, step=step)
+    for _ in range(5):
+        with_steps.log_scalar("episode_return", 1.0)
+    counters = with_steps.state_dict()
+    with_steps.close()
+    resumed = MCAPLogger("run", tmp_path, resume=True)
+    resumed.load_state_dict(counters)
+    resumed.log_scalar("episode_return", 2.0)
+    resumed.log_scalar("final_evaluation", 0.8)
+    resumed.close()
+    assert values(tmp_path / "run", "loss")[0] == list(range(100))
+    assert values(tmp_path / "run", "episode_return") == ([0, 1, 2, 3, 4, 5], [1.0] * 5 + [2.0])
+    assert values(tmp_path / "run", "final_evaluation") == ([0], [0.8])
+
+
 def test_resume_after_a_cut_keeps_what_is_readable(tmp_path: Path) -> None:
     logger = MCAPLogger("run", tmp_path, flush_interval=0)
     for step in range(4):

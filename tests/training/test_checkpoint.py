@@ -119,6 +119,19 @@ def test_saving_a_step_again_replaces_it(tmp_path: Path) -> None:
     assert checkpoint.load() == 5 and counters == {"n": 2} and checkpoint.steps() == (5,)
 
 
+def test_who_goes_back_goes_on_from_there(tmp_path: Path) -> None:
+    value = torch.zeros(1)
+    checkpoint = RunCheckpoint(tmp_path, keep_last=1, value=value)
+    for step in (10, 20, 30):
+        value.fill_(step)
+        checkpoint.save(step)
+    checkpoint = RunCheckpoint(tmp_path, keep_last=2, value=value)
+    value.fill_(21)
+    assert checkpoint.save(21).is_file(), "complete and on the disk when this returns"
+    assert checkpoint.steps() == (21,) and checkpoint.load() == 21 and value.item() == 21
+    assert len(list(tmp_path.glob("*30.torchrl.left"))) == 1, "nothing is lost"
+
+
 def test_components_can_be_chosen(tmp_path: Path) -> None:
     policy, other = torch.ones(2), torch.ones(2)
     RunCheckpoint(tmp_path, policy=policy, other=other).save(1)

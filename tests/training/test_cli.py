@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import signal
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
+from agility_rl.training import cli
 from agility_rl.training.cli import abandon_run, from_json, from_presets, read_config, start_run, to_json, versions
 
 
@@ -144,3 +147,25 @@ def test_a_damaged_configuration_is_named(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text('{"config": {}, "config_version": 99}')
     with pytest.raises(ValueError, match="configuration version 99, expected 1"):
         read_config(tmp_path, Config)
+
+
+def test_every_signal_to_end_lets_the_present_iteration_finish() -> None:
+    before = [signal.getsignal(number) for number in cli.STOPS]
+    for number in cli.STOPS:
+        with cli.interruptible() as interrupted:
+            assert not interrupted()
+            os.kill(os.getpid(), number)
+            assert interrupted()
+            with pytest.raises(KeyboardInterrupt):
+                os.kill(os.getpid(), number)
+    assert [signal.getsignal(number) for number in cli.STOPS] == before
+
+
+def test_who_was_started_by_nohup_outlives_its_terminal() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with cli.interruptible() as interrupted:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not interrupted()
+    finally:
+        signal.signal(signal.SIGHUP, before)

@@ -11,6 +11,8 @@ from agility_rl.modules import Critic, GaussianActor
 from agility_rl.training import ppo
 from agility_rl.training.ppo import PPOUpdate
 
+NETWORKS = ((GaussianActor, (1,)), (Critic, ()))
+
 
 def build(**options: object) -> tuple[GaussianActor, Critic, PPOUpdate]:
     torch.manual_seed(0)
@@ -97,6 +99,18 @@ def test_the_divergence_is_measured_on_a_part_of_the_last_minibatch(
     assert not torch.equal(*seen)
     rows = {tuple(row) for row in batch["observation"].flatten(0, 1).tolist()}
     assert {tuple(row) for sample in seen for row in sample.tolist()} <= rows
+
+
+def test_an_entry_may_be_called_like_what_comes_next() -> None:
+    generator = torch.Generator().manual_seed(1)
+    actor, critic = (kind(2, *size, in_keys=["next_waypoint"], hidden=(4,)) for kind, size in NETWORKS)
+    batch = TensorDict({"next_waypoint": torch.rand(4, 4, 2, generator=generator)}, [4, 4])
+    with torch.no_grad():
+        critic(actor(batch))
+    batch["advantage"] = batch["value_target"] = torch.rand(4, 4, 1, generator=generator)
+    optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()])
+    loss = ClipPPOLoss(actor, critic, entropy_coeff=0.0, loss_critic_type="l2")
+    assert "kl_approx" in PPOUpdate(loss, optimizer, epochs=1, minibatches=1)(batch, generator)
 
 
 def test_an_extra_loss_is_added() -> None:

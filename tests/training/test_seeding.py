@@ -44,6 +44,17 @@ def test_state_round_trip_reaches_generators_already_handed_out() -> None:
     assert (resumed.numpy("n").random(5) == expected[1]).all()
 
 
+def test_what_had_not_drawn_yet_begins_anew_and_processes_keep_their_own() -> None:
+    seeds = Seeds(1)
+    state = seeds.state_dict()
+    first = torch.rand(3, generator=seeds.generator("late")), seeds.numpy("late").random(3)
+    seeds.load_state_dict(state)
+    again = torch.rand(3, generator=seeds.generator("late")), seeds.numpy("late").random(3)
+    assert torch.equal(first[0], again[0]) and (first[1] == again[1]).all()
+    with pytest.raises(ValueError, match="streams of process 0, expected those of 1"):
+        Seeds(1, rank=1).load_state_dict(state)
+
+
 def test_everything_is_seeded() -> None:
     def draw() -> tuple[float, float, float]:
         seed_everything(9)
