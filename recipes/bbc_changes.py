@@ -24,6 +24,8 @@ def check(cfg: Config) -> None:
     Raises:
         ValueError: naming the option and what can stand there.
     """
+    if cfg.iterations < 1:
+        raise ValueError(f"--iterations: expected at least 1, got {cfg.iterations}")
     if unknown := sorted(set(cfg.ppo.symmetric) - set(BEHAVIOURS)):
         raise ValueError(f"--ppo.symmetric: unknown {', '.join(unknown)}; expected some of {', '.join(BEHAVIOURS)}")
     for name, least, most, expected in (

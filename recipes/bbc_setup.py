@@ -19,10 +19,11 @@ from torch.optim.swa_utils import AveragedModel
 from torchrl.data import LazyTensorStorage
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 from torchrl.objectives.value import GAE
+from training_run import run_folder
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
-from agility_rl.deploy.artifact import Artifact, build_manifest
+from agility_rl.deploy.artifact import MANIFEST_FILE, Artifact, build_manifest
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.randomization import NOMINAL, sample_parameters
 from agility_rl.go2 import features
@@ -231,10 +232,19 @@ def build(cfg: Config) -> Components:
     )
 
 
+def provenance(cfg: Config) -> list[str]:
+    """What motion the controller has learned from: that of the policy that it started from, and of this run."""
+    saved_before = run_folder(cfg) / "policy"  # by the run itself, once the policy of --init-from may be gone
+    start = saved_before if (saved_before / MANIFEST_FILE).is_file() else cfg.init_from
+    before = [] if start is None else Artifact.load(start, kind="bbc").manifest.get("data", [])
+    clips = [clip for clip in (cfg.motion.labelled, cfg.motion.unlabelled) if clip]
+    now = ["/".join(clip.resolve().parts[-2:]) for clip in clips] or ["synthetic gaits of agility_rl"]
+    return list(dict.fromkeys([*before, *now]))
+
+
 def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     """Write the controller as an artifact, and beside it the discriminator, whose judgement stage 3 rewards."""
-    clips = [cfg.motion.labelled, cfg.motion.unlabelled]
-    data = ["/".join(clip.resolve().parts[-2:]) for clip in clips if clip] or ["synthetic gaits of agility_rl"]
+    data = provenance(cfg)
     manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=parts.env.dt, data=data)
     manifest |= {"network": parts.bbc.settings, "prior": parts.prior.probabilities.tolist()}
     manifest["simulation"] = {"friction_loss": cfg.env.friction_loss}

@@ -117,6 +117,7 @@ def load_dataset(cfg: MotionConfig, seed: int) -> MotionDataset:
     if (cfg.labelled is None) != (cfg.unlabelled is None):
         raise ValueError("give both --motion.labelled and --motion.unlabelled, or neither for synthetic gaits")
     if cfg.labelled is None or cfg.unlabelled is None:
+        print("no --motion.labelled and --motion.unlabelled: it learns from synthetic gaits, not from a dog")
         labelled, unlabelled = synthetic_dataset_clips(seed)
     else:
         labelled, unlabelled = load_clips(cfg.labelled, label="from name"), load_clips(cfg.unlabelled)

@@ -230,7 +230,7 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         "settings": config,
         "versions": cli.versions(),
         "courses": found,
-        "targets": targets(found),
+        "targets": targets(found, decider.kind),
         "seconds": time.monotonic() - begin,
     }
     cli.write_json(output / "course_evaluation.json", to_json(result))

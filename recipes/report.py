@@ -173,11 +173,18 @@ def page(run: Path) -> str:
         files = f"{cli.CONFIG_FILE}, evaluation.json or course_evaluation.json"
         raise FileNotFoundError(f"{run}: expected a run folder with {files}; check the path")
     record = record or {}
+    if record.get("recipe", "").startswith("easi"):
+        raise ValueError(f"{run}: expected a run of a controller; what EASI found is in its result.json and figures/")
     parts = [f"<h1>{escape(run.resolve().name)}</h1>"]
     origin = [record.get("recipe"), record.get("started"), " ".join(record.get("command", []))]
     parts.append(note(" · ".join(str(entry) for entry in origin if entry)))
     if found:
         parts.append(results(found, run / "figures"))
+        shown = manifest.get("weights", {}).get("sha256")
+        if shown and found.get("weights", shown) != shown:
+            parts.append(note("an earlier policy of this run was evaluated: run recipes/evaluate.py on it again"))
+    if (run / "comparison.json").is_file():
+        parts.append(note("the controller before and after fine-tuning: comparison.json, beside this page"))
     parts += [course_results(course, folder / "figures") for folder, course in courses.items() if course]
     if record and not found and not courses[run]:
         recipe = "evaluate" if record.get("recipe", "bbc_pretrain").startswith("bbc") else "evaluate_course"

@@ -16,6 +16,7 @@ from typing import Any, Protocol, TypeVar
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from agility_rl.deploy.artifact import MANIFEST_FILE
 from agility_rl.record import MCAPLogger
 from agility_rl.training import cli, distributed
 from agility_rl.training.checkpoint import RunCheckpoint
@@ -99,7 +100,7 @@ def finite(total: Tensor, what: str, iteration: int) -> Tensor:
     if not bool(total.isfinite()):
         raise ValueError(
             f"the loss of {what} is {total.item()} in iteration {iteration + 1}; nothing was saved since the last "
-            "checkpoint: look for NaN in teacher and images, or --resume from there with a lower learning rate"
+            "checkpoint: look for NaN in teacher and images, or begin anew by --init-from, with a lower learning rate"
         )
     return total
 
@@ -182,9 +183,18 @@ def _run(
     distributed.wait()
     progress: dict[str, float] = {"iteration": 0, "minutes": 0.0}
     saved = SavedRun(folder / "checkpoints", parts, progress)
+    if resumed and first:
+        print("it goes on with the options that it began with, but for --iterations and --max-minutes")
     if resumed and saved.exists():
         saved.load()
+    elif resumed and (folder / "policy" / MANIFEST_FILE).is_file():
+        raise FileNotFoundError(
+            f"{folder} has a policy and no checkpoint: it would begin anew and replace the policy; begin another run "
+            "with --init-from"
+        )
     else:  # a new run, or one that was killed before its first checkpoint: it begins anew, with the same numbers
+        if resumed and first:
+            print(f"{folder} has no checkpoint yet: it begins anew, with the same numbers")
         try:
             begin(parts, cfg)
         except BaseException:  # nothing is learned yet, and the name stays free

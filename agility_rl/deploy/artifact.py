@@ -193,7 +193,7 @@ class Artifact:
         try:
             module.load_state_dict(self.state)
         except RuntimeError as error:
-            what = " ".join(str(error).split())
+            what = " ".join(str(error).split())[:400]  # of every entry; the first tell enough
             raise ArtifactError(f"{self.folder}: the weights are not those of the expected network: {what}") from error
 
     def check_layout(self, name: str, layout: Iterable[Sequence[Any]]) -> None:

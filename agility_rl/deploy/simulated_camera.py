@@ -11,11 +11,13 @@ import numpy as np
 from agility_rl.deploy.depth import DEPTH_UNIT, Frame, sensor_image
 from agility_rl.deploy.simulated import SimulatedRobot
 from agility_rl.go2 import camera
+from agility_rl.go2.appearance import BONE_GROUP
 
 FRAME_PERIOD = 0.02
 """Time between two images [s]: 50 Hz (supplement S3)."""
 RANGE = 10.0
 """What is farther, or nothing at all, counts as this far [m]; the network's range ends at 4 m."""
+_SEEN: Any = (np.arange(mujoco.mjNGROUP) != BONE_GROUP).astype(np.uint8)
 
 
 class SimulatedCamera:
@@ -54,7 +56,7 @@ class SimulatedCamera:
         eye = data.xpos[trunk] + turn @ np.array(camera.POSITION)
         rays = np.ascontiguousarray(self._rays @ turn.T).reshape(-1)
         mujoco.mj_multiRay(
-            model, data, eye, rays, None, 1, trunk, self._geom, self._distance, None, len(self._geom), mujoco.mjMAXVAL
+            model, data, eye, rays, _SEEN, 1, trunk, self._geom, self._distance, None, len(self._geom), mujoco.mjMAXVAL
         )
         depth = np.where((self._distance < 0.0) | (self._distance > RANGE), RANGE, self._distance)
         return np.rint(depth / DEPTH_UNIT).astype(np.uint16).reshape(camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)

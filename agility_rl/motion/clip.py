@@ -275,7 +275,9 @@ def load(path: str | Path) -> MotionClip:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             data = {key: archive[key] for key in archive.files}
     except (OSError, ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
-        raise MotionError(f"{path}: expected an .npz archive of a clip, got {error}") from error
+        raise MotionError(
+            f"{path}: expected an .npz archive of a clip, written by save(); it is damaged, or something else"
+        ) from error
     missing = sorted({*_SHAPES, "name", "dt"} - data.keys())
     if missing:
         raise MotionError(f"{path}: expected the arrays of a clip, {', '.join(missing)} missing; write it with save()")

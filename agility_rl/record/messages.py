@@ -77,7 +77,7 @@ class Record(NamedTuple):
     """The protobuf message."""
 
 
-class DamageError(Exception):
+class DamageError(ValueError):
     """A file whose middle cannot be read, in contrast to one that merely ends early."""
 
 

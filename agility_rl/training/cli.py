@@ -219,7 +219,10 @@ def read_config(folder: str | Path, kind: type[C]) -> C:
         raise ValueError(
             f"{path} has configuration version {version}, expected {CONFIG_VERSION}; use the release it names"
         )
-    return from_json(kind, values, str(path))
+    try:
+        return from_json(kind, values, str(path))
+    except ValueError as error:
+        raise ValueError(f"{error}; it is the configuration of a run of {record.get('recipe')}.py") from error
 
 
 def to_json(value: Any) -> Any:

@@ -13,6 +13,7 @@ from agility_rl.deploy.depth import DepthPreprocessor
 from agility_rl.deploy.simulated import SimulatedBus, SimulatedRobot, add_world
 from agility_rl.deploy.simulated_camera import FRAME_PERIOD, SimulatedCamera
 from agility_rl.go2 import camera, constants
+from agility_rl.go2.appearance import dress
 from agility_rl.simulation import BatchSimulator, Piece, Shape
 
 BOXES = (
@@ -58,6 +59,19 @@ def test_it_sees_what_training_shows(tmp_path: Path, pitch: float) -> None:
     apart = (camera.metres(seen) - camera.metres(trained)).abs()
     assert (apart > 0.001).float().mean() < 0.003, "but for pixels on an edge"
     assert 0.02 < (camera.metres(trained) < 1.5).float().mean() < 0.9 and trained.max() == 0.5
+
+
+def test_what_only_eyes_see_it_does_not() -> None:
+    """The legs of a robot in a handstand's pose are before its camera, dressed or not."""
+    folded = np.array([0.0, -1.2, -0.9] * 4)
+    images = []
+    for surround in (lambda spec: None, dress):
+        robot = SimulatedRobot(surround=surround)
+        robot.data.qpos[7:19] = folded
+        mujoco.mj_forward(robot.model, robot.data)
+        images.append(SimulatedCamera(robot).counts())
+    np.testing.assert_array_equal(*images)
+    assert (images[0] < 400).any(), "the legs are in view"
 
 
 def test_images_are_taken_at_fifty_hertz() -> None:

@@ -6,14 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from agility_rl.go2.appearance import VISIBLE_GROUP, dress
+from agility_rl.go2.appearance import BONE_GROUP, VISIBLE_GROUP, dress
 from agility_rl.go2.model import ROBOT_GROUP, build_spec
 
 
 @pytest.mark.parametrize("heights", [None, np.zeros((4, 4))], ids=["plane", "height field"])
 def test_a_dressed_robot_moves_as_a_bare_one(heights: np.ndarray | None) -> None:
     bare, dressed = build_spec(heights=heights).compile(), dress(build_spec(heights=heights)).compile()
-    assert (bare.geom_group == ROBOT_GROUP).any() and (dressed.geom_group == VISIBLE_GROUP).all()
+    assert (bare.geom_group == ROBOT_GROUP).any() and set(dressed.geom_group) == {VISIBLE_GROUP, BONE_GROUP}
+    np.testing.assert_array_equal(dressed.body_inertia, bare.body_inertia)
     assert dressed.geom_rgba[:, 3].min() == 1.0
     ends = []
     for model in (bare, dressed):

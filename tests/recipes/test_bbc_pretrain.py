@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -88,6 +89,26 @@ def test_init_from_starts_with_the_given_policy(finished: Path) -> None:
     assert Artifact.load(finished / "child" / "policy").manifest["network"]["hidden"] == [32, 32]
 
 
+def test_a_policy_says_what_its_start_has_learned_from_too(finished: Path) -> None:
+    whole = Artifact.load(finished / "whole")
+    Artifact.save(finished / "of_dogs" / "policy", whole.state, {**whole.manifest, "data": ["dogs/labelled"]})
+    said = run(finished, "--name", "heir", "--iterations", "1", "--init-from", str(finished / "of_dogs")).stdout
+    assert "it learns from synthetic gaits, not from a dog" in said
+    shutil.rmtree(finished / "of_dogs")
+    run(finished, "--resume", str(finished / "heir"), "--iterations", "2")
+    manifest = Artifact.load(finished / "heir").manifest
+    assert manifest["data"] == ["dogs/labelled", "synthetic gaits of agility_rl"]
+
+
+def test_a_run_that_lost_its_checkpoints_keeps_its_policy(finished: Path) -> None:
+    shutil.copytree(finished / "whole", finished / "bare")
+    shutil.rmtree(finished / "bare" / "checkpoints")
+    result = run(finished, "--resume", str(finished / "bare"), "--iterations", "9", check=False)
+    assert result.returncode == 2 and "has a policy and no checkpoint" in result.stderr
+    weights = [Artifact.load(finished / name).manifest["weights"] for name in ("whole", "bare")]
+    assert weights[0] == weights[1]
+
+
 def test_a_run_is_never_overwritten(finished: Path, command: Command) -> None:
     before = (finished / "whole" / "config.json").read_bytes()
     result = command("bbc_pretrain", "smoke", "--runs", finished, "--name", "whole")
@@ -152,6 +173,7 @@ def test_a_killed_run_goes_on(tmp_path: Path, moment: str) -> None:
         (("--motion.labelled", "nowhere", "--motion.unlabelled", "nowhere"), "nowhere"),
         (("--motion.labelled", "nowhere"), "give both"),
         (("--env.terrain", "lava"), "flat"),
+        (("--iterations", "0"), "--iterations: expected at least 1, got 0"),
         (("--motion.label-share", "0"), "expected --imitation.conditional, --imitation.labelled-share"),
         (("--resume", "nowhere"), "nothing to resume"),
     ],

@@ -45,6 +45,12 @@ def test_a_folder_that_is_no_run(tmp_path: Path, module) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_search_of_parameters_is_no_run_of_a_controller(tmp_path: Path, module) -> None:
+    (tmp_path / "config.json").write_text('{"recipe": "easi", "config": {}}')
+    with pytest.raises(ValueError, match=r"what EASI found is in its result.json and figures"):
+        module("report").page(tmp_path)
+
+
 def test_a_damaged_evaluation_is_named(tmp_path: Path, command) -> None:
     (tmp_path / "evaluation.json").write_text("{")
     result = command("report", tmp_path)
