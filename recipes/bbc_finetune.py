@@ -155,6 +155,8 @@ def main(cfg: Config, console: Console | None = None) -> Path:
     if cfg.resume is not None:
         own = cli.read_config(cfg.resume, bbc_config.Config)
         cfg = replace(cfg, init_from=own.init_from, simulator=own.env.simulator, motion=own.motion)
+        if own.init_from is None or own.env.simulator is None:
+            raise ValueError(f"{cfg.resume} is no run of bbc_finetune.py: resume it with its own recipe")
     if cfg.init_from is None or cfg.simulator is None:
         raise ValueError("give --init-from RUN, the BBC to fine-tune, and --simulator RUN, what easi.py found")
     if cfg.target is not None and not cfg.target.is_file():

@@ -215,7 +215,9 @@ def _read_mcap(path: Path) -> dict[str, Any]:
     except DamageError as error:
         raise RobotLogError(str(error)) from error
     if "joint_position" not in rows:
-        raise RobotLogError(f"{path} has no joint positions on {JOINT_STATES}; it has {', '.join(rows) or 'nothing'}")
+        raise RobotLogError(
+            f"{path} has no joint positions on {JOINT_STATES}; it has {', '.join(rows) or 'nothing: truncated?'}"
+        )
     times = list(rows["joint_position"])
     groups: dict[str, Any] = {"time": np.array(times, dtype=np.float64) * 1e-9}
     for name, messages in rows.items():
