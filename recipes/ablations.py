@@ -2,8 +2,8 @@
 
 In:  the clips that ``bbc_pretrain.py`` takes.
 Out: runs ``ablation_VARIANT_SEED`` in ``--runs``, each trained and evaluated, and ``ablations.json`` and
-     ``ablations.md`` there. What is finished is not done again, what was interrupted is resumed: stop it whenever you
-     like, and start it again with further variants or seeds.
+     ``ablations.md`` there, of these and of those before. What is finished is not done again, what was interrupted is
+     resumed: stop it whenever you like, and start it again with further variants or seeds.
 
     python recipes/ablations.py --variants none no_information task_only --seeds 0 1 --motion.labelled DIR \
         --motion.unlabelled DIR
@@ -28,6 +28,7 @@ from rollouts import MotionConfig
 
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.training import cli, metrics
+from agility_rl.training.checkpoint import RunCheckpoint
 
 WITHOUT_IMITATION = [change for change in CPU.changes if not change[1].startswith("imitation.")]
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -36,7 +37,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "labels_1_percent": ("--motion.label-share", "0.01"),
     "no_labels": (
         *("--motion.label-share", "0", "--imitation.no-conditional", "--imitation.labelled-share", "0"),
-        *("--imitation.warm-up", "0", "--imitation.cloning", "0", "--env.rhythm-weight", "0"),
+        *("--imitation.warm-up", "0", "--imitation.cloning", "0", "--env.rhythm-weight", "0", "--trials.start", "None"),
     ),
     "no_information": ("--imitation.information", "0"),
     "prior_raw": ("--imitation.prior-temperature", "None"),
@@ -98,12 +99,17 @@ def train(variant: str, seed: int, config: Config) -> Path:
         return run
     arguments = ["--max-minutes", "None"]  # alike are iterations, however busy the machine is
     arguments += ["--iterations", str(config.iterations)] if config.iterations is not None else []
-    if any((run / "checkpoints").glob("*")):
+    if (run / cli.CONFIG_FILE).is_file():
         arguments += ["--resume", str(run)]
     else:
         arguments += ["--name", run.name, "--runs", str(config.runs), "--seed", str(seed)]
         arguments += [*motion_options(config.motion), *VARIANTS[variant]]
     command("bbc_pretrain", config.preset, *arguments)
+    wanted = (
+        config.iterations or json.loads((run / cli.CONFIG_FILE).read_text(encoding="utf-8"))["config"]["iterations"]
+    )
+    if (done := RunCheckpoint(run / "checkpoints").steps()[-1]) < wanted:
+        raise ValueError(f"{run} ended after {done} of {wanted} iterations; start this again to go on")
     judged = {"--episodes": config.episodes, "--seconds": config.seconds, "--switches": config.switches}
     options = [text for option, value in judged.items() for text in (option, str(value))]
     command("evaluate", str(run), *motion_options(config.motion), *options)
@@ -146,11 +152,16 @@ def main(config: Config, console: Console) -> dict[str, list[dict[str, Any]]]:
         raise ValueError(
             f"expected --seeds and --variants of {', '.join(VARIANTS)}; got {', '.join(unknown) or 'none'}"
         )
+    file = config.runs / "ablations.json"
     rows: dict[str, list[dict[str, Any]]] = {}
+    if file.is_file():
+        rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
     for seed in config.seeds:
         for variant in config.variants:
-            rows.setdefault(variant, []).append(summary(train(variant, seed, config)))
-            cli.write_json(config.runs / "ablations.json", {"format": "agility_rl.ablations", "rows": rows})
+            found = summary(train(variant, seed, config))
+            others = [row for row in rows.get(variant, []) if row["run"] != found["run"]]
+            rows[variant] = sorted([*others, found], key=lambda row: row["run"])
+            cli.write_json(file, {"format": "agility_rl.ablations", "rows": rows})
             (config.runs / "ablations.md").write_text(table(rows), encoding="utf-8")
     console.print(table(rows), highlight=False)
     return rows

@@ -97,6 +97,7 @@ def collect_scenes(
         decision_steps=first.decision_steps,
         command_noise=(1.0, 1.0),
         fastest_canter=first.fastest_canter,
+        start="first",  # where a student believes itself that nobody has told anything else
         seed=seed,
     )
     eye = env.simulator.make_camera()

@@ -41,7 +41,7 @@ def check(cfg: Config) -> None:
             raise ValueError(f"--env.{name.replace('_', '-')}: expected {expected}, got {bad[0]}")
     if cfg.motion.label_share == 0.0:
         named = {f"--imitation.{name.replace('_', '-')}": getattr(cfg.imitation, name) for name in NAMED}
-        named["--env.rhythm-weight"] = cfg.env.rhythm_weight
+        named |= {"--env.rhythm-weight": cfg.env.rhythm_weight, "--trials.start": cfg.trials.start}
         if needed := [option for option, value in named.items() if value]:
             raise ValueError(f"--motion.label-share 0: expected {', '.join(needed)} off, for they need labels")
     if cfg.env.lowest_box > cfg.env.highest_box:

@@ -32,8 +32,8 @@ class MotionConfig:
     """Sampling weight of unlabelled frames in which the dog stands (1 = as recorded)."""
     label_share: float | None = None
     """Keep so much labelled motion, as a share of all motion (0.01: one per cent), alike of every behaviour and the
-    longest clips first; what is cut off is not used at all. All labels when not given. 0: no names are looked at, and
-    what needs them must be off."""
+    longest clips first; what is cut off is not used at all. All labels when not given. 0: no names are looked at,
+    but that episodes start as often in the motion of each, and what needs them must be off."""
 
 
 @dataclass(frozen=True)

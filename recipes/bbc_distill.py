@@ -232,7 +232,8 @@ def main(cfg: Config) -> Path:
         schedule.step()
     env.close()
     known = first.artifact.manifest
-    manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=env.dt, data=known["data"])
+    learned_from = dict.fromkeys(name for teacher in teachers for name in teacher.artifact.manifest["data"])
+    manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=env.dt, data=list(learned_from))
     manifest |= {name: known[name] for name in ("network", "prior") if name in known}
     manifest["simulation"] = {"friction_loss": first.friction_loss}  # whatever --env says
     manifest["teachers"] = {

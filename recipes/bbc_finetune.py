@@ -8,7 +8,7 @@ Out: ``runs/NAME/`` as ``bbc_pretrain.py`` writes it, and ``comparison.json``: t
 
     python recipes/bbc_finetune.py cpu --init-from runs/my_run --simulator runs/easi --target logs/target.truth.json \
         --motion.labelled DIR --motion.unlabelled DIR
-    python recipes/bbc_finetune.py cpu --resume runs/finetune       # goes on, then compares
+    python recipes/bbc_finetune.py cpu --resume runs/finetune       # then compares; give --target and --episodes anew
 
 Presets: ``smoke`` (seconds), ``cpu`` (about ten minutes on two cores), ``paper``.
 """
@@ -122,7 +122,13 @@ def compare(cfg: Config, run: Path, console: Console) -> dict[str, Any]:
         for stage, path in (("before", cfg.init_from), ("after", run)):
             controller = load_controller(path)
             options = Evaluation(
-                path, episodes=cfg.episodes, seconds=cfg.seconds, seed=cfg.seed, simulator=simulator, switches=0
+                path,
+                episodes=cfg.episodes,
+                seconds=cfg.seconds,
+                seed=cfg.seed,
+                num_threads=cfg.num_threads,
+                simulator=simulator,
+                switches=0,
             )
             figures = run / "figures" / f"{place}_{stage}"
             found = evaluate_behaviours(controller, options, motion, states, figures)
@@ -154,7 +160,8 @@ def main(cfg: Config, console: Console | None = None) -> Path:
     console = console or cli.console(120)
     if cfg.resume is not None:
         own = cli.read_config(cfg.resume, bbc_config.Config)
-        cfg = replace(cfg, init_from=own.init_from, simulator=own.env.simulator, motion=own.motion)
+        cfg = replace(cfg, init_from=own.init_from, simulator=own.env.simulator, motion=own.motion, seed=own.seed)
+        cfg = replace(cfg, iterations=cfg.iterations or own.iterations)
         if own.init_from is None or own.env.simulator is None:
             raise ValueError(f"{cfg.resume} is no run of bbc_finetune.py: resume it with its own recipe")
     if cfg.init_from is None or cfg.simulator is None:

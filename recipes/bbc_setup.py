@@ -247,7 +247,8 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     data = provenance(cfg)
     manifest = build_manifest("bbc", features.CONTROLLER_LAYOUTS, control_period=parts.env.dt, data=data)
     manifest |= {"network": parts.bbc.settings, "prior": parts.prior.probabilities.tolist()}
-    manifest["simulation"] = {"friction_loss": cfg.env.friction_loss}
+    friction = parts.env.simulator.parameter("friction_loss").mean().item()  # an identified one has its own
+    manifest["simulation"] = {"friction_loss": round(friction, 6)}
     Artifact.save(folder / "policy", saved(parts.bbc, parts.averaged).state_dict(), manifest)
     layouts = {"motion": features.MOTION_LAYOUT}
     manifest = build_manifest("discriminator", layouts, control_period=parts.env.dt, data=data)

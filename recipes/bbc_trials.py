@@ -59,6 +59,7 @@ def hold_trial(cfg: Config, run: Path, finished: int, save: Callable[[Path], Non
         switches=cfg.trials.switches,
         seed=SEED,
         num_threads=cfg.env.num_threads,
+        simulator=cfg.env.simulator,
         motion=MotionConfig(cfg.motion.labelled, cfg.motion.unlabelled),
     )
     with torch.random.fork_rng(devices=[]):  # the training goes on with its own random numbers

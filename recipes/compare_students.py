@@ -6,8 +6,8 @@ Out: tables on the screen, ``OUTPUT/student_comparison.json`` (also after every 
 
     python recipes/compare_students.py runs/with_0 runs/with_1 runs/without_0 runs/without_1 --teacher runs/my_teacher
 
-All of them meet the same courses, drawn from a seed that no training used. A success rate of several runs is their mean
-with a Student-t interval over the runs; of one run it has a Wilson interval.
+All of them meet courses of one seed, which no training used; the first of every robot are the same. A success rate of
+several runs is their mean with a Student-t interval over the runs; of one run it has a Wilson interval.
 """
 
 from __future__ import annotations

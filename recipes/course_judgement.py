@@ -140,12 +140,12 @@ def targets(courses: Mapping[str, Mapping[str, Any]], kind: str = "teacher") -> 
             passed = value is not None and value.estimate >= limit
             rows.append({"name": f"{course}: {name}", "value": value, "target": f">= {limit:g}", "passed": passed})
 
-    add("full", "success", "success", share * 0.8)
+    add("full", "success", "success", round(share * 0.8, 3))
     add("full", "mean speed, m/s", "speed", 1.1)
     for name in CHALLENGE:
-        add(name, "success", "success", share * 0.95)
+        add(name, "success", "success", round(share * 0.95, 3))
     add("hurdles", "peak speed, m/s", "peak_speed", 3.2)
-    add("box", "success", "success", share * 0.9)
+    add("box", "success", "success", round(share * 0.9, 3))
     return rows
 
 

@@ -254,6 +254,8 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError(
             "expected --seconds at least 1 s longer than --settle >= 0, and --switch-seconds of at least 1"
         )
+    if config.simulator is not None and config.randomize:
+        raise ValueError("--randomize: a simulator of --simulator has its own parameters; give one of the two")
     begin = time.monotonic()
     controller = load_controller(config.run)
     motion = load_motion(config.motion, controller.trained, config.seed)

@@ -34,9 +34,12 @@ def targets(found: Mapping[str, Any]) -> list[dict[str, Any]]:
     def add(name: str, value: metrics.Interval | None, sign: str, limit: float) -> None:
         judge(name, value, f"{sign} {limit:g}", *((limit, math.inf) if sign == ">=" else (-math.inf, limit)))
 
+    gait = dict.fromkeys(key for entry in found["behaviours"].values() for key in entry["gait"])
     for name, entry in found["behaviours"].items():
         add(f"{name}: recognised", entry["recognised"], ">=", 0.9)
         add(f"{name}: speed error, m/s", entry["errors"].get("speed"), "<=", SPEED_LIMIT[name])
+        for key in gait if not entry["gait"] else ():
+            judge(f"{name}: {key}", None, "a dog's, and it always fell", math.nan, math.nan)
         for key, compared in entry["gait"].items():
             target = "{:.2f} to {:.2f} (dog) within 25 %".format(*compared["dog"])
             judge(f"{name}: {key}", compared["robot"], target, *compared["allowed"])

@@ -173,8 +173,10 @@ def page(run: Path) -> str:
         files = f"{cli.CONFIG_FILE}, evaluation.json or course_evaluation.json"
         raise FileNotFoundError(f"{run}: expected a run folder with {files}; check the path")
     record = record or {}
-    if record.get("recipe", "").startswith("easi"):
-        raise ValueError(f"{run}: expected a run of a controller; what EASI found is in its result.json and figures/")
+    if (recipe := record.get("recipe", "")).startswith("easi"):
+        raise ValueError(
+            f"{run}: expected a run of a controller, got one of {recipe}.py; its own files say what it found"
+        )
     parts = [f"<h1>{escape(run.resolve().name)}</h1>"]
     origin = [record.get("recipe"), record.get("started"), " ".join(record.get("command", []))]
     parts.append(note(" · ".join(str(entry) for entry in origin if entry)))

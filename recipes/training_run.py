@@ -11,13 +11,14 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from agility_rl.deploy.artifact import MANIFEST_FILE
 from agility_rl.record import MCAPLogger
+from agility_rl.simulation import simulator_device
 from agility_rl.training import cli, distributed
 from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.display import Display
@@ -26,6 +27,10 @@ from agility_rl.training.display import Display
 class RunConfig(Protocol):
     """Options that every training has."""
 
+    @property
+    def simulator(self) -> Literal["batch", "warp"]: ...
+    @property
+    def device(self) -> str: ...
     @property
     def name(self) -> str: ...
     @property
@@ -163,7 +168,7 @@ def run(
     Returns:
         The run folder.
     """
-    with distributed.processes():
+    with distributed.processes(cuda=simulator_device(cfg.simulator, cfg.device).type == "cuda"):
         return _run(recipe, cfg, build(cfg), begin, iterate, save_policy, headline)
 
 

@@ -137,9 +137,11 @@ def trained_bbc(trained: Trained) -> Path:
     file = trained.run / "config.json"
     if file.is_file():
         try:
-            return Path(json.loads(file.read_text(encoding="utf-8"))["config"]["bbc"])
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            told = json.loads(file.read_text(encoding="utf-8"))["config"].get("bbc")
+        except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{file} is damaged or no run's configuration: {error}; give the BBC as --bbc") from error
+        if told is not None:  # who learns from images alone has no robots
+            return Path(told)
     expected = trained.artifact.manifest.get("bbc")
     for manifest in sorted(trained.run.resolve().parent.glob(f"*/{MANIFEST_FILE}")):
         try:

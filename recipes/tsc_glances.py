@@ -94,7 +94,7 @@ def resized(trained: Trained, cfg: Config) -> RecurrentStudent:
         return network
     state, known = student.state_dict(), network.state_dict()
     same = all(student.settings[name] == network.settings[name] for name in ENCODER)
-    anew = "memory.glance.correction." if same else ("depth_encoder.", "memory.glance.")
+    anew = "memory.glance.correction." if same else ("depth_encoder.", "memory.glance.", "memory.fusion.0.")
     kept = {
         name: value for name, value in known.items() if not name.startswith(anew) and value.shape == state[name].shape
     }
@@ -120,8 +120,10 @@ def load_images(cfg: Config, device: torch.device) -> tuple[TensorDictBase, Tens
             raise ValueError(f"{path}: expected two robots or more, of which some are held out, got {robots}")
         rows = TensorDict(tensors, [time_steps, robots])  # type: ignore[arg-type]
         apart = min(max(1, round(cfg.held_out * robots)), robots - 1)
-        test.append(rows[:, :apart].flatten().to(device))
-        train.append(rows[:, apart:].flatten().to(device))
+        learned = torch.ones(robots, dtype=torch.bool)
+        learned[((torch.arange(apart) + 0.5) * robots / apart).long()] = False  # of those led by a teacher, and others
+        test.append(rows[:, ~learned].flatten().to(device))
+        train.append(rows[:, learned].flatten().to(device))
     return torch.cat(train), torch.cat(test)  # type: ignore[return-value, arg-type]
 
 

@@ -76,7 +76,7 @@ def check(cfg: Config) -> None:
 def collect(cfg: Config) -> TensorDictBase:
     """Walk and look: :func:`glances.asked`, ``[T, N]``."""
     student = load_trained(cfg.student, "student").network.settings
-    sizes = ("memory", "encoder_channels", "encoder_hidden", "encoder_features", "glance_hidden")
+    sizes = ("memory", "encoder_channels", "encoder_hidden", "encoder_features", "glance_hidden", "heading_gate")
     robots = ("course", "num_robots", "num_threads", "start_spread", "start_after", "episode_length")
     run, trained = resolve(
         replace(

@@ -15,6 +15,7 @@ Presets: ``smoke`` (seconds), ``cpu`` (two cores). Ctrl-C ends the iteration and
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -171,6 +172,7 @@ def build(cfg: Config) -> Components:
             f"--env.course {course.name}: {trained.artifact.folder} knows a course whose obstacles stand elsewhere; it "
             f"can practise on {trained.course}"
         )
+    student.heading_gate = math.inf  # it perceives all headings itself, also those it was helped with
     recall = TensorDictModule(torch.nn.Identity(), in_keys=[NEXT_HIDDEN], out_keys=[keys.HIDDEN])
     return Components(
         seeds=seeds,
@@ -227,7 +229,7 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
         data=before["data"],
     )
     manifest |= {name: before[name] for name in INHERITED if name in before}
-    manifest["course"] = parts.env.arena.layout.course.name
+    manifest["course"] = cfg.env.course or before.get("course", "full")
     manifest["practised_from"] = before["weights"]["sha256"]
     Artifact.save(folder / "policy", saved(parts.student, parts.averaged).state_dict(), manifest)
 

@@ -208,7 +208,7 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
         "teacher",
         features.CONTROLLER_LAYOUTS,
         control_period=parts.env.dt * cfg.env.decision_steps,
-        data=[],
+        data=parts.bbc.artifact.manifest.get("data", []),
     )
     manifest["network"] = parts.teacher.settings
     manifest["bbc"] = parts.bbc.artifact.manifest["weights"]["sha256"]

@@ -143,7 +143,9 @@ def check(cfg: Config) -> None:
         )
     if cfg.bits not in (8, 16):
         raise ValueError(f"--bits: images are stored in 8 or 16 bits, got {cfg.bits}")
-    smallest = min(cfg.representation.images, cfg.env.num_robots * own.steps) // cfg.representation.minibatches
+    images = min(cfg.representation.images, cfg.env.num_robots * own.steps)
+    largest = max(1, -(-images // cfg.representation.minibatches))
+    smallest = images % largest or largest  # the last one has what is left
     if cfg.byol and smallest < 2:
         raise ValueError(f"--representation: a minibatch of BYOL needs 2 images or more, got {smallest}")
     if min(glance.every, glance.epochs, glance.batch, glance.kept) < 1 or min(glance.steps, glance.images) < 0:

@@ -139,6 +139,13 @@ def build(cfg: Config, trained: Trained) -> Components:
         routes=[[list(leg) for leg in route] for route in env.arena.layout.course.legs],
         solids=[kind.solids() for kind in OBSTACLES.values()],
     ).to(device)
+    own_points = [slot.obstacle for slot in env.arena.layout.course.slots if slot.goals != slot.kind.way_points]
+    if teacher.settings["num_place"] and own_points:
+        env.close()
+        raise ValueError(
+            f"course {cfg.env.course}: its {own_points[0]} has way-points of its own, and a student that knows its "
+            "place knows those of the type only; give --env.course one without, or a teacher without place"
+        )
     for name in frozen_parts(cfg):
         getattr(student, name).requires_grad_(False)
     # A tenth to a third less time for the convolutions on a CPU.

@@ -97,8 +97,11 @@ class TerminalDevice:
     def _write(self) -> None:
         with contextlib.suppress(OSError):  # the other end of the terminal has gone
             while (text := self._lines.get()) is not None:
-                self._screen.write(text)
+                columns = os.get_terminal_size(self._file).columns or 80
+                self._screen.write("\r\x1b[K" + text[: columns - 1])
                 self._screen.flush()
+            self._screen.write("\n")
+            self._screen.flush()
 
     def read(self) -> Sequence[str | Stick]:
         """Keys since the last call; an escape waits for the next call, since it may be half of an arrow."""
@@ -126,22 +129,18 @@ class TerminalDevice:
     def show(self, status: Status) -> None:
         """Write the state over the last line, a few times a second."""
         if self._shown % SHOW_EVERY == 0:
-            columns = os.get_terminal_size(self._file).columns or 80
             text = "  ".join(" ".join(words.split()) for _, words in status.lines())
             with contextlib.suppress(queue.Full):  # the line before is still being written
-                self._lines.put_nowait("\r\x1b[K" + text[: columns - 1])
+                self._lines.put_nowait(text)
         self._shown += 1
 
     def close(self) -> None:
         """Give the terminal back as it was."""
         if self._before is not None:
-            self._termios.tcsetattr(self._file, self._termios.TCSADRAIN, self._before)
+            with contextlib.suppress(self._termios.error):  # the other end has gone
+                self._termios.tcsetattr(self._file, self._termios.TCSADRAIN, self._before)
             self._before = None
-            try:
-                for last in ("\n", None):
-                    self._lines.put(last, timeout=CLOSE_SECONDS)
-            except queue.Full:  # the thread ends once the screen takes what it is writing
-                with contextlib.suppress(queue.Empty):
-                    self._lines.get_nowait()
-                self._lines.put(None)
+            with contextlib.suppress(queue.Empty):  # a line that is still to be written
+                self._lines.get_nowait()
+            self._lines.put(None)
             self._writer.join(CLOSE_SECONDS)

@@ -204,6 +204,10 @@ class AgilityEnv(MaskedResets):
         )
 
     @property
+    def cheap_resets(self) -> bool:
+        return self.randomization is None and self.depth is None
+
+    @property
     def num_robots(self) -> int:
         """Number of robots."""
         return self.batch_size[0]

@@ -168,6 +168,10 @@ class LocomotionEnv(MaskedResets):
         )
 
     @property
+    def cheap_resets(self) -> bool:
+        return self.randomization is None
+
+    @property
     def num_robots(self) -> int:
         """Number of robots."""
         return self.batch_size[0]

@@ -88,6 +88,7 @@ class ObservationGroups:
         self.history = torch.zeros(num_robots, features.HISTORY, features.NUM_PROPRIOCEPTION, device=device)
         features.check_motion_offsets(motion_offsets)
         self.motion_offsets = torch.tensor(motion_offsets, device=device)
+        self._span = motion_offsets[-1]
         self._motion = RecentFrames(num_robots, motion_offsets[-1] + 1, features.NUM_MOTION, device)
         self.touched = torch.zeros(num_robots, 4, dtype=torch.bool, device=device)
 
@@ -106,7 +107,7 @@ class ObservationGroups:
         self.history = torch.where(row[..., None], self._measure(state, touched)[:, None], self.history)
         rows = rows_of(mask)
         present = _motion_frame(state)[rows, None]
-        past = present.expand(-1, int(self.motion_offsets[-1]), -1) if past is None else past
+        past = present.expand(-1, self._span, -1) if past is None else past
         self._motion.fill(mask, rows, torch.cat((past, present), 1))
 
     def update(self, state: LocomotionState) -> None:

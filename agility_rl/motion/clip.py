@@ -274,7 +274,9 @@ def load(path: str | Path) -> MotionClip:
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             data = {key: archive[key] for key in archive.files}
-    except (OSError, ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+    except OSError as error:
+        raise MotionError(f"{path}: expected an .npz archive of a clip, got: {error}") from error
+    except (ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
         raise MotionError(
             f"{path}: expected an .npz archive of a clip, written by save(); it is damaged, or something else"
         ) from error

@@ -106,6 +106,8 @@ class WarpSimulator:
         self._sensordata = wp.to_torch(data.sensordata)
         self._mocap_position, self._mocap_quaternion = wp.to_torch(data.mocap_pos), wp.to_torch(data.mocap_quat)
         self._parameters = SimulationParameters(self.world, num_simulations, self._field, self.device)
+        hinges = self.world.hinges, self.world.hinge_speeds  # lists would be copied to the GPU whenever they are used
+        self._hinges, self._hinge_speeds = (torch.tensor(x, dtype=torch.int64, device=self.device) for x in hinges)
         self._initial = self._qpos[:1].clone()
         self._initial[:, JOINTS] = torch.tensor(constants.DEFAULT_POSE, device=self.device)
         self._qpos.copy_(self._initial.expand_as(self._qpos))
@@ -242,8 +244,8 @@ class WarpSimulator:
         for array, value in ((self._mocap_position, position), (self._mocap_quaternion, quaternion)):
             array.copy_(torch.where(mask[:, None, None], value, array))
         row = mask[:, None]
-        self._qpos[:, self.world.hinges] = torch.where(row, hinge_angle, self._qpos[:, self.world.hinges])
-        self._qvel[:, self.world.hinge_speeds] = self._qvel[:, self.world.hinge_speeds].masked_fill(row, 0.0)
+        self._qpos[:, self._hinges] = torch.where(row, hinge_angle, self._qpos[:, self._hinges])
+        self._qvel[:, self._hinge_speeds] = self._qvel[:, self._hinge_speeds].masked_fill(row, 0.0)
         self._read()
 
     def _read(self) -> None:
@@ -251,7 +253,7 @@ class WarpSimulator:
         self.root_position, self.root_quaternion, self.joint_position = qpos[:, :3], qpos[:, 3:7], qpos[:, JOINTS]
         self.root_linear_velocity, self.root_angular_velocity = qvel[:, :3], qvel[:, 3:6]
         self.joint_velocity = qvel[:, JOINT_SPEEDS]
-        self.hinge_angle = qpos[:, self.world.hinges]
+        self.hinge_angle = qpos[:, self._hinges]
         self.contact_force = torch.linalg.vector_norm(self._sensordata[:, FORCES].unflatten(-1, (-1, 3)), dim=-1)
 
     def set_parameters(self, mask: Tensor, **fields: Tensor) -> None:

@@ -180,7 +180,7 @@ class RunCheckpoint:
 
     def _register_random_state(self) -> None:
         if _RANDOM not in self._checkpoint:
-            self._checkpoint.register(_RANDOM, GlobalRNGState())
+            self._checkpoint.register(_RANDOM, _GlobalState())
 
 
 def find_damage(path: str | Path) -> str | None:
@@ -248,6 +248,18 @@ def _saveable(name: str, component: Any) -> Any:
         f"component {name!r} is a {type(component).__name__}; expected something with state_dict and load_state_dict, "
         "a torch.Generator, a tensor, a TensorDict, or a dict"
     )
+
+
+class _GlobalState(GlobalRNGState):
+    """Generators of this process, on a machine that may have fewer GPUs than the one that saved them."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        state = dict(state_dict)
+        if "torch_cuda" in state:
+            state["torch_cuda"] = list(state["torch_cuda"])[: torch.cuda.device_count()]
+            if not state["torch_cuda"]:
+                del state["torch_cuda"]
+        super().load_state_dict(state)
 
 
 class _GeneratorState:

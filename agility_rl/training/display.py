@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping
 from types import TracebackType
@@ -56,14 +57,16 @@ class Display:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._live is not None:
-            self._live.__exit__(kind, error, trace)
+            with contextlib.suppress(OSError):  # a terminal that was closed; what is to be saved comes after this
+                self._live.__exit__(kind, error, trace)
 
     def update(self, iteration: int, metrics: Mapping[str, float]) -> None:
         """Show the metrics of a finished iteration."""
         if self._first is None:
             self._first = iteration - 1
         if self._live is not None:
-            self._live.update(self._table(iteration, metrics))
+            with contextlib.suppress(OSError):
+                self._live.update(self._table(iteration, metrics))
         elif (iteration - self._first) % self.lines_every == 1 or self.lines_every == 1 or iteration == self.total:
             shown = "  ".join(f"{name} {metrics[name]:.3g}" for name in self.headline if name in metrics)
             self.console.print(

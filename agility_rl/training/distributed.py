@@ -17,10 +17,13 @@ from torch import Tensor, nn
 
 
 @contextlib.contextmanager
-def processes() -> Iterator[None]:
+def processes(cuda: bool | None = None) -> Iterator[None]:
     """Join the processes that ``torchrun`` started, and leave them at the end; nothing if there are none.
 
     Tensors on a CPU travel by gloo, those on a GPU by NCCL.
+
+    Args:
+        cuda: whether each has a GPU; by default where there is any.
 
     Example:
         >>> with processes():
@@ -30,7 +33,7 @@ def processes() -> Iterator[None]:
     if int(os.environ.get("WORLD_SIZE", "1")) < 2 or dist.is_initialized():
         yield
         return
-    if torch.cuda.is_available():
+    if torch.cuda.is_available() if cuda is None else cuda:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
         dist.init_process_group("cpu:gloo,cuda:nccl")
     else:

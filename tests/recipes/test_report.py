@@ -47,7 +47,7 @@ def test_a_folder_that_is_no_run(tmp_path: Path, module) -> None:
 
 def test_a_search_of_parameters_is_no_run_of_a_controller(tmp_path: Path, module) -> None:
     (tmp_path / "config.json").write_text('{"recipe": "easi", "config": {}}')
-    with pytest.raises(ValueError, match=r"what EASI found is in its result.json and figures"):
+    with pytest.raises(ValueError, match=r"got one of easi.py; its own files say"):
         module("report").page(tmp_path)
 
 

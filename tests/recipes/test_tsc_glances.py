@@ -100,6 +100,17 @@ def test_glances_move_what_sees_and_nothing_else(
     assert "144 images to learn from, 48 held out" in out and "before; held out: error_latent" in out
     same = ("teacher", "bbc", "course", "camera", "control_period", "network")
     assert all(after.manifest[name] == before.manifest[name] for name in same)
+    artifacts = module("tsc_artifacts")
+    assert artifacts.trained_bbc(artifacts.load_trained(run)).is_dir(), "its own run says of no controller"
+
+
+def test_robots_that_are_held_out_are_led_and_not(module: Module, images: Path) -> None:
+    recipe = module("tsc_glances")
+    cfg = recipe.Config(**(options_of(images.parent) | {"held_out": 0.5}))
+    train, test = recipe.load_images(cfg, torch.device("cpu"))
+    depth = load_file(images / "images.safetensors")["depth"]
+    for rows, robots in ((train, [0, 2]), (test, [1, 3])):
+        assert torch.equal(rows["depth"], depth[:, robots].flatten(0, 1))
 
 
 def test_an_encoder_of_other_sizes_keeps_the_rest(module: Module, images: Path, student: Any) -> None:
