@@ -306,6 +306,7 @@ def test_the_paper_preset_is_the_papers(module: Module) -> None:
         (("--bbc", "TEACHER"), "expected an artifact of kind 'bbc', got 'teacher'"),
         (("--init-from", "TEACHER"), "expected a student of tsc_student.py, got an artifact of kind 'teacher'"),
         (("--env.course", "nowhere"), "unknown course 'nowhere'; expected one of full"),
+        (("--env.course", "hurdles"), "course hurdles: its bar_jump has way-points of its own"),
         (("--representation.images", "2", "--representation.minibatches", "2"), "BYOL needs 2 images or more, got 1"),
         (("--glance.batch", "0"), "expected every, epochs, batch and kept above 0"),
         (("--env.num-robots", "1"), "--glance.images: expected two robots or more"),
