@@ -150,15 +150,19 @@ def test_a_damaged_configuration_is_named(tmp_path: Path) -> None:
 
 
 def test_every_signal_to_end_lets_the_present_iteration_finish() -> None:
-    before = [signal.getsignal(number) for number in cli.STOPS]
-    for number in cli.STOPS:
-        with cli.interruptible() as interrupted:
-            assert not interrupted()
-            os.kill(os.getpid(), number)
-            assert interrupted()
-            with pytest.raises(KeyboardInterrupt):
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in cli.STOPS}  # whoever started the tests
+    try:
+        for number in cli.STOPS:
+            with cli.interruptible() as interrupted:
+                assert not interrupted()
                 os.kill(os.getpid(), number)
-    assert [signal.getsignal(number) for number in cli.STOPS] == before
+                assert interrupted()
+                with pytest.raises(KeyboardInterrupt):
+                    os.kill(os.getpid(), number)
+            assert signal.getsignal(number) == signal.SIG_DFL
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def test_who_was_started_by_nohup_outlives_its_terminal() -> None:
