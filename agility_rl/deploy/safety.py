@@ -167,7 +167,7 @@ def too_large(value: Tensor, limit: Tensor, unit: str) -> str | None:
 
 
 def no_orientation(quaternion: Tensor) -> str | None:
-    """No unit quaternion: the sensor has not spoken yet, and whoever took that for an orientation would stand upright.
+    """No unit quaternion ``[4]``: the sensor has not spoken yet, and taken for an orientation that would be upright.
 
     Example:
         >>> no_orientation(torch.zeros(4))

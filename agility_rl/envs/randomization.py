@@ -85,7 +85,12 @@ DESCRIBED = ("trunk_mass_offset", "trunk_com_offset", "ground_friction", "stiffn
 
 
 def described(parameters: Mapping[str, Tensor]) -> Tensor:
-    """The privileged observation ``[N, 29]`` of these parameters, gains as deviations from the nominal ones.
+    """The privileged observation ``[N, 29]`` of these parameters, gains as deviations from the nominal ones [1].
+
+    Source: layout and units: :data:`agility_rl.go2.features.PRIVILEGED_LAYOUT`.
+
+    Args:
+        parameters: those of :data:`DESCRIBED`, ``[N, size]``, as ``Simulator.parameter`` gives them.
 
     Example:
         >>> fields, privileged = sample_parameters(2, Randomization(), torch.Generator().manual_seed(0))

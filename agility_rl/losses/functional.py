@@ -19,6 +19,16 @@ Criterion = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 def missed(estimate: Tensor, target: Tensor, key: object) -> Tensor:
     """Target minus estimate, of one shape; the target gets no gradient.
 
+    Source: ours.
+
+    Args:
+        estimate: ``[*B, ...]``.
+        target: the same shape and unit.
+        key: what the target is called, for the message.
+
+    Returns:
+        The shape of both.
+
     Raises:
         ValueError: if the shapes differ: they might be broadcast to one that compares every sample with every other.
 
