@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import argparse
 import os
-import statistics
-import time
 from collections.abc import Callable
 
 import torch
+import turns
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
@@ -113,23 +112,11 @@ def main() -> None:
         "env.step, 10 decisions/s": stepper(fifth, given_fifth),
         "LocomotionEnv.step, no course": locomotion(robots, threads),
     }
-    generator = torch.Generator().manual_seed(0)
-    offset = 0.05 * torch.randn(options.steps, robots, 12, generator=generator)
-    targets = torch.tensor(constants.DEFAULT_POSE) + offset
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for turn in range(options.rounds + 1):
-        for name, step in contenders.items():
-            start = time.perf_counter()
-            for target in targets:
-                step(target)
-            if turn:  # the first turn warms up
-                seconds[name].append(time.perf_counter() - start)
-    print(f"{robots} robots, {threads} threads, {torch.get_num_threads()} torch threads, load {os.getloadavg()[0]:.1f}")
-    reference = seconds["bare Batch.step, course model"]
-    for name, times in seconds.items():
-        rate = robots * options.steps / statistics.median(times)
-        share = statistics.median(one / other for one, other in zip(reference, times, strict=True))
-        print(f"{name:32} {rate:10.0f} control steps/s {share:8.1%} of bare")
+    targets = turns.shifting_weight(options.steps, robots)
+    steppers = {name: turns.through(step, targets) for name, step in contenders.items()}
+    found = turns.in_turns(steppers, options.rounds)
+    print(turns.circumstances(robots, threads))
+    turns.print_rates(found, robots * options.steps, "control steps")
 
 
 if __name__ == "__main__":

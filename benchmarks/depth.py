@@ -11,12 +11,12 @@ from __future__ import annotations
 import argparse
 import os
 import statistics
-import time
 from collections.abc import Callable
 
 import mujoco
 import numpy as np
 import torch
+import turns
 
 from agility_rl.envs import COURSES, AgilityEnv
 from agility_rl.go2 import camera
@@ -66,28 +66,18 @@ def main() -> None:
     env.reset()
     assert env.depth is not None
     eye, everyone, few = env.depth.camera, torch.ones(robots, dtype=torch.bool), min(robots, 32)
-    noisy = env.depth
-
-    def observe() -> None:
-        noisy.begin(everyone)
-
-    contenders: dict[str, tuple[Callable[[], object], int]] = {
-        "bare mj_multiRay, one thread": (bare(env, few), few),
-        f"camera, {options.threads} threads": (lambda: eye.render(everyone), robots),
-        "camera, noise, normalisation": (observe, robots),
+    noisy, cast = env.depth, bare(env, few)
+    contenders: dict[str, Callable[[], float]] = {
+        "bare mj_multiRay, one thread": lambda: turns.seconds(cast) / few,
+        f"camera, {options.threads} threads": lambda: turns.seconds(lambda: eye.render(everyone)) / robots,
+        "camera, noise, normalisation": lambda: turns.seconds(lambda: noisy.begin(everyone)) / robots,
     }
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for turn in range(options.rounds + 1):
-        for name, (take, number) in contenders.items():
-            start = time.perf_counter()
-            take()
-            if turn:  # the first turn warms up
-                seconds[name].append((time.perf_counter() - start) / number)
+    found = turns.in_turns(contenders, options.rounds)
     load = os.getloadavg()[0]
     print(f"{robots} robots, course {options.course}, {eye.model.ngeom} shapes before the camera, load {load:.1f}")
-    reference = seconds["bare mj_multiRay, one thread"]
-    for name, times in seconds.items():
-        ratio = statistics.median(one / other for one, other in zip(reference, times, strict=True))
+    reference = found["bare mj_multiRay, one thread"]
+    for name, times in found.items():
+        ratio = turns.speed_up(reference, times)
         print(f"{name:32} {1.0 / statistics.median(times):8.0f} images/s {ratio:8.2f} x bare")
     env.close()
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import statistics
 import sys
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
+import turns
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -99,19 +99,10 @@ def main() -> None:
 
         actor = make_actor(options.policy, ("walk", "trot"), 1.0)
         contenders["the same with a BBC"] = collector(simulator, space, individuals, steps, actor.policy)
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for turn in range(options.rounds + 1):
-        for name, run in contenders.items():
-            start = time.perf_counter()
-            run()
-            if turn:  # the first turn warms up
-                seconds[name].append(time.perf_counter() - start)
-    print(f"{robots} robots, {threads} threads, {torch.get_num_threads()} torch threads, load {os.getloadavg()[0]:.1f}")
-    reference = seconds["bare Batch.step"]
-    for name, times in seconds.items():
-        rate = robots * steps / statistics.median(times)
-        share = statistics.median(one / other for one, other in zip(reference, times, strict=True))
-        print(f"{name:38} {rate:10.0f} steps/s {share:8.1%} of bare")
+    timed = {name: partial(turns.seconds, run) for name, run in contenders.items()}
+    found = turns.in_turns(timed, options.rounds)
+    print(turns.circumstances(robots, threads))
+    turns.print_rates(found, robots * steps, "steps")
 
 
 if __name__ == "__main__":

@@ -15,9 +15,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import statistics
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ from typing import Any
 import mujoco.batch
 import mujoco_warp
 import torch
+import turns
 import warp
 from tensordict import TensorDict
 from torch import Tensor
@@ -231,25 +230,18 @@ def main() -> None:
 
 def speed(args: argparse.Namespace) -> None:
     """Steps a second of all contenders, in turns."""
-    steps, everything = 10, contenders(args)
-    generator = torch.Generator().manual_seed(args.seed)
-    targets = POSE + 0.05 * torch.randn(steps, args.robots, 12, generator=generator)
-    seconds: dict[str, list[float]] = {name: [] for name in everything}
-    for turn in range(args.rounds + 1):
-        for name, step in everything.items():
-            own = targets.to(args.device) if name.startswith("warp") else targets
-            start = time.perf_counter()
-            for target in own:
-                step(target)
-            if args.device != "cpu":
-                torch.cuda.synchronize()
-            if turn:  # the first turn warms up
-                seconds[name].append(time.perf_counter() - start)
-    print(f"\n{args.robots} robots, {args.threads} threads, Warp on {args.device}, load {os.getloadavg()[0]:.1f}")
-    for name, times in seconds.items():
-        reference = seconds[f"{name.split(',')[0]}, bare"]
-        share = statistics.median(one / other for one, other in zip(reference, times, strict=True))
-        print(f"{name:20} {args.robots * steps / statistics.median(times):10.0f} steps/s {share:8.1%} of bare")
+    steps = 10
+    targets = turns.shifting_weight(steps, args.robots, args.seed)
+    there = {"batch": turns.CPU, "warp": torch.device(args.device)}
+    steppers = {}
+    for name, step in contenders(args).items():
+        device = there[name.split(",")[0]]
+        steppers[name] = turns.through(step, targets.to(device), device)
+    found = turns.in_turns(steppers, args.rounds)
+    print(f"\n{turns.circumstances(args.robots, args.threads)}, Warp on {args.device}")
+    for engine in there:
+        own = {name: times for name, times in found.items() if name.startswith(engine)}
+        turns.print_rates(own, args.robots * steps, "steps")
 
 
 if __name__ == "__main__":

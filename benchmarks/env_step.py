@@ -12,11 +12,8 @@ from __future__ import annotations
 
 import argparse
 import os
-import statistics
 import tempfile
-import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +21,7 @@ import mujoco
 import mujoco.batch
 import numpy as np
 import torch
+import turns
 from peer import Peer
 from tensordict import TensorDict
 from torch import Tensor
@@ -143,37 +141,18 @@ def main() -> None:
         "env.step, noise, randomised, pushed": environment(robots, threads, **disturbed),
         "the same with resets": environment(robots, threads, resets=True, **disturbed),
     }
-    generator = torch.Generator().manual_seed(0)
-    # Robots that shift their weight about the default pose: all contenders keep four feet on the ground.
-    offset = 0.05 * torch.randn(options.steps, robots, 12, generator=generator)
-    targets = torch.tensor(constants.DEFAULT_POSE) + offset
-
-    def through(step: Callable[[Tensor], None]) -> float:
-        start = time.perf_counter()
-        for target in targets:
-            step(target)
-        return time.perf_counter() - start
-
-    turns: dict[str, Callable[[], float]] = {name: partial(through, step) for name, step in contenders.items()}
+    targets = turns.shifting_weight(options.steps, robots)
+    steppers = {name: turns.through(step, targets) for name, step in contenders.items()}
     with tempfile.TemporaryDirectory() as folder:
         peer = None
         if options.peer is not None:
             peer = mjbatch(options.peer, targets, threads, Path(folder))
-            turns["mjbatch's Batch.step"] = peer.ask
-        seconds: dict[str, list[float]] = {name: [] for name in turns}
-        for index in range(options.rounds + 1):
-            for name, turn in turns.items():
-                took = turn()
-                if index:  # the first turn warms up
-                    seconds[name].append(took)
+            steppers["mjbatch's Batch.step"] = peer.ask
+        found = turns.in_turns(steppers, options.rounds)
         if peer is not None:
             peer.close()
-    print(f"{robots} robots, {threads} threads, {torch.get_num_threads()} torch threads, load {os.getloadavg()[0]:.1f}")
-    reference = seconds["bare Batch.step"]
-    for name, times in seconds.items():
-        rate = robots * options.steps / statistics.median(times)
-        share = statistics.median(one / other for one, other in zip(reference, times, strict=True))
-        print(f"{name:38} {rate:10.0f} steps/s {share:8.1%} of bare")
+    print(turns.circumstances(robots, threads))
+    turns.print_rates(found, robots * options.steps, "steps")
 
 
 if __name__ == "__main__":

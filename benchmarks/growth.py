@@ -11,15 +11,16 @@ from __future__ import annotations
 import argparse
 import os
 import statistics
-import time
 from collections.abc import Callable
+from functools import partial
 from unittest.mock import patch
 
 import agility_speed
 import env_step
 import torch
+import turns
 
-from agility_rl.go2 import camera, constants
+from agility_rl.go2 import camera
 
 COURSE_SIZES = ("tunnel", "bar_jump", "hurdles", "weave_poles", "box", "full", "full_walls")
 IMAGE_SCALES = (0.5, 1.0, 2.0)
@@ -27,28 +28,15 @@ STEPS = 10
 """Control steps of a turn."""
 
 
-def measured(contenders: dict[str, tuple[Callable[[], object], int]], rounds: int) -> dict[str, float]:
+def measured(contenders: dict[str, tuple[Callable[[], float], int]], rounds: int) -> dict[str, float]:
     """Median microseconds of each, divided by what it does at once."""
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for turn in range(rounds + 1):
-        for name, (run, number) in contenders.items():
-            start = time.perf_counter()
-            run()
-            if turn:  # the first turn warms up
-                seconds[name].append((time.perf_counter() - start) / number)
-    return {name: 1e6 * statistics.median(times) for name, times in seconds.items()}
+    found = turns.in_turns({name: run for name, (run, _) in contenders.items()}, rounds)
+    return {name: 1e6 * statistics.median(times) / contenders[name][1] for name, times in found.items()}
 
 
-def targets(robots: int) -> torch.Tensor:
-    """Joint targets of a turn about the default pose: four feet stay on the ground."""
-    offset = 0.05 * torch.randn(STEPS, robots, 12, generator=torch.Generator().manual_seed(0))
-    return torch.tensor(constants.DEFAULT_POSE) + offset
-
-
-def through(step: Callable[[torch.Tensor], None], robots: int) -> tuple[Callable[[], object], int]:
+def through(step: Callable[[torch.Tensor], None], robots: int) -> tuple[Callable[[], float], int]:
     """A turn of an environment, and how many steps of robots it is."""
-    given = targets(robots)
-    return lambda: [step(target) for target in given], STEPS * robots
+    return turns.through(step, turns.shifting_weight(STEPS, robots)), STEPS * robots
 
 
 def robots_grow(numbers: list[int], threads: int, rounds: int) -> dict[str, float]:
@@ -94,7 +82,7 @@ def images_grow(robots: int, threads: int, rounds: int) -> dict[str, float]:
             with patch.multiple(camera, **size):
                 eye.render(everyone)
 
-        contenders[f"{size['IMAGE_WIDTH']} x {size['IMAGE_HEIGHT']} pixels"] = (render, robots)
+        contenders[f"{size['IMAGE_WIDTH']} x {size['IMAGE_HEIGHT']} pixels"] = (partial(turns.seconds, render), robots)
     found = measured(contenders, rounds)
     env.close()
     return found

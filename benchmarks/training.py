@@ -16,19 +16,20 @@ import argparse
 import gc
 import math
 import statistics
-import time
 import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from resource import RUSAGE_SELF, getrusage
 from types import ModuleType
 from typing import Any
 
 import torch
+import turns
 from mujoco.batch import Batch
 from plain_ppo import PHASES, Plain, load_recipe
 from tensordict import TensorDict
@@ -43,17 +44,6 @@ SHOWN = ("bare", "simulator", "env.step", "roll-out", "iteration", "plain loop")
 START = 400
 """First iteration; by then all ramps are over."""
 OURS = ("agility_rl", "recipes")
-
-
-def seconds(work: Callable[[], object], device: torch.device) -> float:
-    """Time of a piece of work, until the device has done it."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    start = time.perf_counter()
-    work()
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter() - start
 
 
 @contextmanager
@@ -120,7 +110,7 @@ def contenders(parts: Any, steps: int) -> tuple[dict[str, Callable[[], object]],
     bare, begin = (bare_batch if isinstance(env.simulator, BatchSimulator) else bare_warp)(env)
     pose = torch.tensor(constants.DEFAULT_POSE, device=env.device)
     scale = torch.tensor(constants.ACTION_SCALE, device=env.device)
-    targets = pose + 0.05 * torch.randn(steps, robots, 12, generator=env.generator, device=env.device)
+    targets = turns.shifting_weight(steps, robots).to(env.device)
     policy = parts.bbc.privileged_policy()
     env.reset()
 
@@ -142,17 +132,16 @@ def measure(recipe: ModuleType, cfg: Any, args: argparse.Namespace, look: bool) 
     """Print the figures of one number of robots; ``look`` for waits too."""
     parts, robots = recipe.build(cfg), cfg.env.num_robots
     device = parts.env.device
-    turns, begin = contenders(parts, args.steps)
-    found: dict[str, list[float]] = {name: [] for name in turns}
-    for turn in range(args.rounds + 1):
-        for name, work in turns.items():
-            begin()
-            spent = seconds(work, device)
-            if turn:  # the first turn warms up
-                found[name].append(spent)
-    steps = dict.fromkeys(turns, args.steps) | {"roll-out": cfg.ppo.steps}
+    works, begin = contenders(parts, args.steps)
+
+    def after_begin(work: Callable[[], object]) -> float:
+        begin()
+        return turns.seconds(work, device)
+
+    found = turns.in_turns({name: partial(after_begin, work) for name, work in works.items()}, args.rounds)
+    steps = dict.fromkeys(works, args.steps) | {"roll-out": cfg.ppo.steps}
     rate = {name: robots * steps[name] / statistics.median(times) for name, times in found.items()}
-    share = statistics.median(bare / env for bare, env in zip(found["bare"], found["env.step"], strict=True))
+    share = turns.speed_up(found["bare"], found["env.step"])
     loops = {"iteration": lambda number: recipe.iterate(parts, cfg, number)}
     if cfg.simulator == "batch":
         own = recipe.build(cfg)
@@ -161,7 +150,9 @@ def measure(recipe: ModuleType, cfg: Any, args: argparse.Namespace, look: bool) 
     times: dict[str, list[float]] = {name: [] for name in loops}
     for number in range(START, START + args.rounds + 1):
         for name, iterate in loops.items():
-            times[name].append(seconds(lambda run=iterate, at=number, lap=laps[name]: lap.append(run(at)), device))
+            times[name].append(
+                turns.seconds(lambda run=iterate, at=number, lap=laps[name]: lap.append(run(at)), device)
+            )
     rate |= {name: robots * cfg.ppo.steps / statistics.median(spent[1:]) for name, spent in times.items()}
     most = torch.cuda.max_memory_allocated() if device.type == "cuda" else 1024 * getrusage(RUSAGE_SELF).ru_maxrss
     print(
@@ -173,7 +164,7 @@ def measure(recipe: ModuleType, cfg: Any, args: argparse.Namespace, look: bool) 
     print("         an iteration, s: " + ", ".join(f"{name} {last[f'time/{name}']:.3f}" for name in PHASES), flush=True)
     for name in ("env.step", "roll-out") if look else ():
         with waits() as places:
-            turns[name]()
+            works[name]()
         print(f"waits in {steps[name]} steps of {name}: {sum(places.values())}")
         for place, count in places.most_common(25):
             print(f"  {count:4}  {place}")
