@@ -1,5 +1,8 @@
-"""Options of the recipes that train a Basic Behaviour Controller; their defaults are Table S1 and the supplement to
-the number, and the released code's values where those are silent."""
+"""Options of the recipes that train a Basic Behaviour Controller.
+
+The preset ``paper`` (``bbc_presets.py``) holds Table S1 and the supplement to the number, and the released code's
+values where those are silent; what is ours says so.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +110,8 @@ class EnvConfig:
     friction_loss: float = 0.2
     """Dry friction of the joints [N m]; 0 as in the released simulation is a tenth faster."""
     simulator: Path | None = None
-    """Identified simulator to train in: ``result.json`` of ``easi.py``. It takes the place of the randomisation."""
+    """Identified simulator to train in: ``result.json`` of ``easi.py``. What it tells takes the place of the
+    randomisation; the rest is as ``randomize`` says."""
     num_threads: int | None = None
 
 
@@ -128,7 +132,10 @@ class PPOConfig:
     lmbda: float = 0.95
     """Table S1."""
     entropy: float = 0.01
+    """Weight of the entropy beside a surrogate of weight 1. ``paper`` halves the released 2, 5, 0.01 and 0.1 of
+    surrogate, value, entropy and privileged encoder, and the norm of their gradient (method notes, section 3.7)."""
     value: float = 1.0
+    """Weight of the critic's squared error, which is not clipped (released: clipped)."""
     max_grad_norm: float = 1.0
     precision: Precision = "float32"
     """Of the hidden layers in the update; ``auto`` is bfloat16 on hardware that multiplies in it."""
@@ -147,6 +154,8 @@ class PPOConfig:
     """Behaviours that are held to that. Gaits with a leading leg are not: between one and its image lies another."""
     initial_std: float = 1.0
     min_std: float = 0.1
+    """Least deviation of an action, alike for all joints (ours; released: 0.05, 0.02 and 0.05 of the joints' ranges,
+    which is 0.094, 0.091 and 0.085)."""
     hidden: tuple[int, ...] = (512, 256, 128)
     """Supplement S6."""
     critic_warm_up: int = 0
@@ -170,7 +179,8 @@ class ImitationConfig:
     discriminator_learning_rate: float = 5e-4
     """Table S1."""
     encoder_learning_rate: float = 1e-3
-    """Table S1: class and shift heads."""
+    """Table S1. It is the rate of class and shift heads; the trunk that they share has the discriminator's (ours;
+    released: three optimisers, each of which moves the trunk too)."""
     weight_decay: float = 1e-3
     gradient_penalty: float = 0.1
     cloning: int = 0
@@ -223,6 +233,8 @@ class AdaptationConfig:
     every: int = 20
     """Iterations between roll-outs that use the history encoder (released code)."""
     minibatches: int = 8
+    """Steps by which history encoder and estimator learn from every roll-out (ours; released: 20 from each
+    ``every``-th one for the encoder)."""
     privileged: float = 0.1
     """Weight of pulling the privileged encoder towards the history encoder (released code)."""
     privileged_ramp: tuple[int, int] = (1000, 2000)

@@ -96,6 +96,7 @@ def training(cfg: Config) -> bbc_config.Config:
             base.env,
             simulator=cfg.simulator,
             num_threads=cfg.num_threads,
+            action_delay_from=0,  # what a pre-training learns at first without
             progress_weight=base.env.progress_left,  # no fading: it walks already
             progress_left=base.env.progress_left,
         ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -44,7 +45,8 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
     model: dict[str, Any] = {"friction_loss": cfg.env.friction_loss}
     if cfg.env.simulator is not None:
         simulator = load_simulator(cfg.env.simulator)
-        randomization, model = simulator.randomization, model | dict(simulator.model)
+        randomization = replace(randomization or NOMINAL, draw=simulator.draw)
+        model |= simulator.model
     patterns = None
     if cfg.env.rhythm_weight:
         patterns = stride_patterns(dataset.labelled_clips, {"walk": cfg.env.walk_growth})

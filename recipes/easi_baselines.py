@@ -8,8 +8,8 @@ method searches it, and the table compares their errors with the truth. Conditio
     outside   as clean, but every gain of the target lies outside the first search range, [1/1.5, 1.5] x nominal
     outside_noisy   noisy and outside
 
-Source: issue of stage 2; range of the targets and error |x - x*| / x*: method notes, sections 6.3 and 6.5; log of 4,000
-steps: supplement S2.
+Source: range of the targets and error |x - x*| / x*: method notes, sections 6.3 and 6.5; log of 4,000 steps:
+supplement S2; the comparison is ours.
 
 In:  nothing, or the controller that makes the logs (``--easi.policy RUN``); an open-loop trot without one.
 Out: ``runs/NAME/`` with ``CONDITION/target_NN.json`` (one file a target), the logs beside them, ``table.md`` and

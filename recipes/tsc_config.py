@@ -165,6 +165,7 @@ class CurriculumConfig:
     difficulty: float = 0.0
     """Share of the range of heights at the start; 1 is the released difficulty at once."""
     difficulty_step: float = 0.1
+    """By which share it grows (ours; released: 0.01 m, method notes 5.7)."""
     obstacles: int = 1
     """Obstacles of an episode at the start; one more whenever the difficulty is full. 6 or more: all at once."""
     practice: float = 1.0

@@ -32,12 +32,12 @@ class EvolutionStrategy:
         high: ``[D]``, upper ends of the first generation.
         population: N, individuals of a generation.
         survival_rate: s, share of them that counts.
-        covariance: ``"diagonal"`` (paper) or ``"full"``.
-        centre: ``"new"`` (paper) or ``"old"`` mean, about which the spread is taken.
-        learning_rate: share of the new mean and covariance in the next distribution, in (0, 1]; 1 as in the paper.
-        min_std: least standard deviation of every coordinate, 0 as in the paper; keeps a search alive.
+        covariance: ``"diagonal"`` (EASI's release) or ``"full"``.
+        centre: ``"new"`` (EASI's release) or ``"old"`` mean, about which the spread is taken.
+        learning_rate: share of the new mean and covariance in the next distribution, in (0, 1]; 1 as released.
+        min_std: least standard deviation of every coordinate, 0 as released; keeps a search alive.
         averaged: share of the generations, counted from the last, whose means :attr:`estimate` averages; with noisy
-            scores that is nearer than the last mean alone (Polyak and Juditsky 1992). 0 as in the paper.
+            scores that is nearer than the last mean alone (Polyak and Juditsky 1992). 0 as released.
         lower: ``[D]``, individuals are clipped to these; ``None`` for no bound. May lie below ``low``.
         upper: ``[D]``, the same from above.
         generator: source of randomness; the state dict includes it.

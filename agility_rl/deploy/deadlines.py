@@ -84,8 +84,7 @@ class Deadlines:
     A period is missed if its work ends after the period does, or if it could not even begin within it; then it is
     skipped, and the loop goes on at the next multiple of ``T``, so that it does not fall behind.
 
-    Source: no formula; design section 7 and reference notes, section 4 (loops that sleep for T after their work run
-    slower than 1 / T).
+    Source: no formula; ours (loops that sleep for T after their work run slower than 1 / T).
 
     Args:
         period: T [s].

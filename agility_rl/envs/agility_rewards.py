@@ -68,7 +68,7 @@ def reach_goal(state: AgilityState) -> Tensor:
 
 
 def collision(state: AgilityState) -> Tensor:
-    """Number of thighs and calves in contact (S5)."""
+    """Number of thighs and calves in contact (weight: S5; that they are counted: released code)."""
     return rewards.collision(state.robot)
 
 

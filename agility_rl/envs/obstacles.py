@@ -264,7 +264,7 @@ def _seesaw() -> Obstacle:
 
 # Tire jump -----------------------------------------------------------------------------------------------------------
 
-TIRE_INNER, TIRE_OUTER, TIRE_SEGMENTS = 0.391, 0.451, 16
+TIRE_INNER, TIRE_OUTER, TIRE_SEGMENTS = 0.391, 0.451, 16  # of round segments: 0.060 thick, released: 0.058
 GANTRY_SIZE, GANTRY_FOOT = 1.5, 0.6
 _POST = 0.025  # half thickness of the gantry's bars: ours
 

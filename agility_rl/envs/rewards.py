@@ -157,7 +157,7 @@ def torque_limit(state: LocomotionState) -> Tensor:
 
 
 def collision(state: LocomotionState) -> Tensor:
-    """Number of thighs and calves in contact (S4)."""
+    """Number of thighs and calves in contact (weight: S4; that they are counted: released code)."""
     return (torch.cat((state.thigh_contact, state.calf_contact), -1) > COLLISION_FORCE).sum(-1).float()
 
 

@@ -31,7 +31,7 @@ FOOT_CONTACT_FORCE = 2.0
 OBSERVATION_LIMIT = 100.0
 """Measured numbers are clipped to +- this (released code)."""
 PEAK_WINDOW = 0.9
-"""Seconds over which the highest trunk position counts for a jump."""
+"""Seconds over which the highest trunk position counts for a jump (ours, as is what observes it)."""
 
 
 class Entry(NamedTuple):

@@ -25,7 +25,7 @@ class DiscriminatorLoss(KeyedLoss):
     on raw features would weigh each by its unit. All coefficients are already applied to the losses returned.
 
     Source: Eq. (10); coefficients 0.1, 0.05 and 1e-4: released code (method notes, section 3.4). On normalised
-    features a penalty of 5 kept the discriminator from winning (DESIGN.md, section 8).
+    features a penalty of 5 keeps the discriminator from winning (ours; the preset ``cpu`` of stage 1).
 
     Keys read:
         (expert, ...)   every entry of ``discriminator.in_keys`` in the nested TensorDict of the expert; with the

@@ -21,7 +21,7 @@ class TransitionDiscriminatorLoss(KeyedLoss):
     .. math:: L = \tfrac12 \left(-E_E \tilde D(s, a, s') + E_\pi \tilde D(s, a, s')\right)
               + \tfrac{\lambda_{gp}}{2} \left(E_E \|\nabla \tilde D\|^2 + E_\pi \|\nabla \tilde D\|^2\right)
 
-    A critic without bound on its slope could grow for ever. Either its weights are clipped, as in the paper: call
+    A critic without bound on its slope could grow for ever. Either its weights are clipped, as in EASI's release: call
     :meth:`clip_weights` before every step. Or the penalty bounds the slope; it is taken at both groups, because it is
     zero-centred and a critic that is flat on the robot's transitions only could still fall without limit on the
     simulator's. It is taken with respect to the *normalised* inputs where the discriminator writes them.
@@ -42,8 +42,8 @@ class TransitionDiscriminatorLoss(KeyedLoss):
 
     Args:
         discriminator: module that writes one logit ``[*B, 1]``; any inputs.
-        weight_clip: bound of every weight and bias for :meth:`clip_weights` (paper: 0.01); schedulable; ``None`` makes
-            that method do nothing.
+        weight_clip: bound of every weight and bias for :meth:`clip_weights` (released: 0.01); schedulable; ``None``
+            makes that method do nothing.
         gradient_penalty: coefficient; schedulable; ``None`` leaves the term, and its cost, out.
         reduction: ``"mean"`` (default) or ``"sum"`` over samples.
 

@@ -21,7 +21,7 @@ class MotionTrunk(nn.Module):
 
     One instance serves discriminator and predictor, which then share its parameters.
 
-    Source: section S6, Table S1 (two frames); layer sizes, ReLU and zero biases: released code (method notes,
+    Source: Table S1 (two frames); layer sizes, ReLU and zero biases: released code (method notes,
     section 3.1).
 
     Args:
@@ -87,7 +87,7 @@ class Discriminator(TensorDictModuleBase):
     The bracket exists only with ``num_skills``: a projection discriminator that also asks whether the motion suits
     the skill.
 
-    Source: Eq. (10) takes D; section S6 and released code for the sizes (98-512-256-1, head weights U(-1, 1), biases
+    Source: Eq. (10) takes D; released code for the sizes (98-512-256-1, head weights U(-1, 1), biases
     zero; method notes, section 3.1). The conditional form is our option, off in the paper (Miyato and Koyama 2018,
     arXiv:1802.05637).
 

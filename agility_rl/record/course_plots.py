@@ -65,7 +65,7 @@ class PlanView:
 def plan_view(episodes: Sequence[PlanView]) -> Figure:
     """Episodes side by side, obstacles to scale, the path coloured by behaviour.
 
-    Source: issue 4; no paper formula.
+    Source: ours; no formula.
 
     Args:
         episodes: at least one.
@@ -94,7 +94,7 @@ def plan_view(episodes: Sequence[PlanView]) -> Figure:
 def behaviour_use(seconds: Mapping[str, Tensor]) -> Figure:
     """Share of time of each behaviour before each obstacle, as one bar a row.
 
-    Source: issue 4; no paper formula.
+    Source: ours; no formula.
 
     Args:
         seconds: row label to ``[5]``, time (or any other count) in each behaviour.

@@ -320,6 +320,10 @@ def test_the_paper_preset_is_table_s1_and_the_supplement(module: Callable[[str],
     assert len(paper.motion.offsets) == 2 and paper.motion.offsets[1] - paper.motion.offsets[0] == 1
     assert (imitation.prior_weight, imitation.imitation_reward, imitation.task_reward) == (1e-3, 0.2, 0.2)
     assert ppo.hidden == (512, 256, 128)  # section S6
+    # Method notes, section 3.7: 2 surrogate + 5 value - 0.01 entropy + 0.1 privileged, their gradient at most 1 long.
+    weights = (1.0, ppo.value, ppo.entropy, paper.adaptation.privileged, ppo.max_grad_norm)
+    assert [2.0 * weight for weight in weights] == [2.0, 5.0, 0.01, 0.1, 1.0]
+    assert paper.env.friction_loss == 0.0  # section 4.1
     assert imitation.prior_temperature is None, "Algorithm S1, line 3: skills are drawn from the prior"
     assert imitation.criterion == "least_squares" and not imitation.conditional  # Eq. (10)
     assert paper.env.terrain == "rough" and paper.env.randomize and paper.env.push_interval  # section S2

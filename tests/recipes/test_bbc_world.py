@@ -11,6 +11,7 @@ import torch
 
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.motion import synthesize_gait
+from agility_rl.training.seeding import Seeds
 
 Module = Callable[[str], ModuleType]
 
@@ -57,3 +58,20 @@ def test_fewer_labels_are_alike_of_every_behaviour_and_of_the_longest_clips(modu
     assert (nameless["skill"] == named["skill"]).float().mean() < 0.5
     with pytest.raises(ValueError, match=r"--motion.label-share: expected a share from 0 to 1, got 0"):
         world.fewer_labels(clips, 0.0, total)
+
+
+@pytest.mark.parametrize("randomize", [False, True])
+def test_an_identified_simulator_leaves_the_rest_to_the_randomisation(
+    module: Module, tmp_path: Path, randomize: bool
+) -> None:
+    record, world, smoke = module("record_log"), module("bbc_world"), module("bbc_presets").SMOKE
+    log = record.main(record.Config(log=tmp_path / "t.csv", steps=100, truth=record.Truth(calf_stiffness=0.7)))
+    options = replace(smoke.env, num_robots=8, num_threads=1, randomize=randomize, rhythm_weight=0.0)
+    cfg = replace(smoke, env=replace(options, simulator=log.with_suffix(".truth.json")))
+    env = world.make_env(cfg, world.load_dataset(cfg.motion, 0), Seeds(0))
+    env.reset()
+    stiffness, friction = env.simulator.parameter("stiffness"), env.simulator.parameter("ground_friction")
+    torch.testing.assert_close(stiffness[:, 2], torch.full((8,), 0.7 * 40.0))  # supplement S2 searches gains alone
+    torch.testing.assert_close(stiffness[:, 0], torch.full((8,), 40.0))
+    assert len(friction.unique()) == (8 if randomize else 1)
+    env.close()
