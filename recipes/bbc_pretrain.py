@@ -32,11 +32,10 @@ from bbc_world import set_boxes
 from held_fixed import fit, infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import Laps, own_options, run, run_folder
+from training_run import Laps, own_options, policy_to_start_from, run, run_folder
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
-from agility_rl.deploy.artifact import Artifact
 from agility_rl.go2 import features
 from agility_rl.losses import functional
 from agility_rl.training import cli, distributed
@@ -169,7 +168,7 @@ def begin(parts: Components, cfg: Config) -> None:
         print(f"changes during the run (--changes): {later}")
     warm_up_predictor(parts, cfg.imitation)
     if cfg.init_from:
-        Artifact.load(cfg.init_from, kind="bbc").fill(parts.bbc)
+        policy_to_start_from(cfg.init_from, "bbc", cfg.ppo.hidden).fill(parts.bbc)
     elif cfg.imitation.cloning:
         error = clone_behaviour(parts.bbc, parts.demonstrations, cfg.imitation.cloning)
         print(f"cloned {len(parts.dataset.labelled_clips)} labelled clips: squared action error {error:.3f}")

@@ -19,7 +19,7 @@ from torch.optim.swa_utils import AveragedModel
 from torchrl.data import LazyTensorStorage
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 from torchrl.objectives.value import GAE
-from training_run import run_folder
+from training_run import policy_to_start_from, run_folder
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
@@ -106,7 +106,7 @@ def build(cfg: Config) -> Components:
         if cfg.init_from is None:
             raise ValueError("--imitation.anchor holds on to the policy of --init-from RUN; give both or neither")
         anchor = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std).to(device).requires_grad_(False)
-        Artifact.load(cfg.init_from, kind="bbc").fill(anchor)
+        policy_to_start_from(cfg.init_from, "bbc", ppo.hidden).fill(anchor)
     critic_keys = [keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.COMMAND, keys.PEAK]
     critic_keys += [keys.HISTORY] if ppo.critic_history else []
     # Who is not told of what lies in the way judges a robot only when it stumbles.

@@ -16,7 +16,7 @@ from typing import Any, Literal, Protocol, TypeVar
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from agility_rl.deploy.artifact import MANIFEST_FILE
+from agility_rl.deploy.artifact import MANIFEST_FILE, Artifact, ArtifactError
 from agility_rl.record import MCAPLogger
 from agility_rl.simulation import simulator_device
 from agility_rl.training import cli, distributed
@@ -77,6 +77,22 @@ def own_options(cfg: C) -> C:
 def run_folder(cfg: RunConfig) -> Path:
     """Where a run writes."""
     return cfg.resume or cfg.runs / cfg.name
+
+
+def policy_to_start_from(path: Path, kind: str, hidden: tuple[int, ...]) -> Artifact:
+    """What ``--init-from`` names, if its layers are as wide as those that this run builds.
+
+    Raises:
+        ArtifactError: if they are not, or it is no such artifact.
+    """
+    start = Artifact.load(path, kind=kind)
+    own = start.manifest.get("network", {}).get("hidden", list(hidden))
+    if own != list(hidden):
+        sizes = " ".join(str(size) for size in own)
+        raise ArtifactError(
+            f"{start.folder}: its hidden layers are {own}, this run builds {list(hidden)}; give --ppo.hidden {sizes}"
+        )
+    return start
 
 
 class Laps:

@@ -23,7 +23,7 @@ from course_metrics import judge, set_course
 from held_fixed import fit, infer
 from tensordict import TensorDictBase
 from torch import Tensor
-from training_run import Laps, own_options, run
+from training_run import Laps, own_options, policy_to_start_from, run
 from tsc_cloning import clone
 from tsc_config import PRESETS, Config
 from tsc_ppo import add_rewards, limit_deviations, value_finished, what_happened
@@ -31,7 +31,7 @@ from tsc_script import read
 from tsc_setup import Components, build, save_policy
 
 from agility_rl.behaviours import BEHAVIOURS
-from agility_rl.deploy.artifact import Artifact
+from agility_rl.deploy.artifact import ArtifactError
 from agility_rl.deploy.task import fastest_canter
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.losses import functional
@@ -86,9 +86,11 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
 def begin(parts: Components, cfg: Config) -> None:
     """Where a new run starts from: another run's teacher, a copied script, or the one corrected by the other."""
     if cfg.init_from is not None:
-        start = Artifact.load(cfg.init_from, kind="teacher")
+        start = policy_to_start_from(cfg.init_from, "teacher", cfg.ppo.hidden)
         read_place, place = start.manifest.get("network", {}).get("num_place", 0), parts.teacher.settings["num_place"]
-        if read_place < place:  # who did not read its place goes on as it was; who did is refused by a run without
+        if read_place > place:
+            raise ArtifactError(f"{start.folder} reads its place, this run's teacher does not; give --place")
+        if read_place < place:  # who did not read its place goes on as it was
             start = replace(start, state=widen_place(start.state, place - read_place))
         if (had := fastest_canter(start)) != cfg.env.fastest_canter:  # it canters as fast as it did
             start = replace(start, state=rescale_canter(start.state, had, cfg.env.fastest_canter))

@@ -87,6 +87,10 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished: Path) -> None:
 def test_init_from_starts_with_the_given_policy(finished: Path) -> None:
     run(finished, "--name", "child", "--iterations", "1", "--init-from", str(finished / "whole"))
     assert Artifact.load(finished / "child" / "policy").manifest["network"]["hidden"] == [32, 32]
+    other = ("--init-from", str(finished / "whole"), "--ppo.hidden", "16", "8")
+    refused = run(finished, "--name", "other", *other, check=False)
+    assert refused.returncode == 2 and "[32, 32], this run builds [16, 8]; give --ppo.hidden 32 32" in refused.stderr
+    assert not (finished / "other").exists()
 
 
 def test_a_policy_says_what_its_start_has_learned_from_too(finished: Path) -> None:

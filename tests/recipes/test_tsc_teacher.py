@@ -111,8 +111,11 @@ def test_a_teacher_learns_to_read_its_place_from_where_it_was(recipe: ModuleType
     assert not torch.equal(moved, parent.deployable_policy()(seen.clone())["loc"])
     parts.env.close()
     reader = recipe.train(replace(smoke, name="reader", iterations=1, place=True))
-    with pytest.raises(ArtifactError, match="not those of the expected network"):
+    with pytest.raises(ArtifactError, match="reads its place, this run's teacher does not; give --place"):
         recipe.train(replace(without, name="refused", init_from=reader))
+    wider = replace(smoke, name="wider", init_from=reader, ppo=replace(smoke.ppo, hidden=(64, 32)))
+    with pytest.raises(ArtifactError, match=r"layers are \[.*\], this run builds \[64, 32\]; give --ppo.hidden"):
+        recipe.train(wider)
 
 
 def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
