@@ -168,7 +168,7 @@ def make_collector(
     """What individuals do: roll out the policy, or replay the log.
 
     Raises:
-        ValueError: if a trajectory is shorter than a window, or windows do not fit into the log.
+        ValueError: if windows do not fit into the log.
     """
     generator = seeds.generator("collector")
     if cfg.collection == "policy":
@@ -182,8 +182,6 @@ def make_collector(
             latency=cfg.latency,
         )
     steps, skip = replay_window(cfg)
-    if not 1 <= steps <= cfg.trajectory_length:
-        raise ValueError(f"expected --window from 1 to --trajectory-length {cfg.trajectory_length}, got {steps}")
     windows = cut_windows(log, steps, skip=skip, noise=cfg.noise, latency=cfg.latency)
     return ReplayCollector(simulator, space, windows, num_windows=cfg.trajectory_length // steps, generator=generator)
 
@@ -256,8 +254,10 @@ def train(cfg: Config, console: Console | None = None) -> Path:
     folder = cli.start_run(cfg, folder, resume=cfg.resume is not None, recipe="easi", inputs=parts.inputs)
     progress = {"generation": 0, "minutes": 0.0}
     checkpoint = parts.checkpoint(folder / "checkpoints", progress)
-    if cfg.resume is not None:
+    if cfg.resume is not None and checkpoint.steps():
         checkpoint.load()
+    elif cfg.resume is not None:
+        print(f"{folder} has no checkpoint yet: it begins anew, with the same numbers")
     logger = MCAPLogger(folder.name, folder.parent, resume=cfg.resume is not None)
     start = time.monotonic() - 60.0 * progress["minutes"]
     display = Display("easi", cfg.generations, headline=HEADLINE, lines_every=1, console=console)
@@ -269,6 +269,7 @@ def train(cfg: Config, console: Console | None = None) -> Path:
             logger.log_metrics(metrics, step=progress["generation"])
             display.update(int(progress["generation"]), metrics)
             if progress["generation"] % cfg.checkpoint_every == 0:
+                logger.flush()  # first: what a checkpoint goes on from is in the log, whenever the search is killed
                 checkpoint.save(int(progress["generation"]))
             if cfg.max_minutes is not None and progress["minutes"] >= cfg.max_minutes:
                 break

@@ -200,6 +200,12 @@ def compare_on(cfg: Config, folder: Path, index: int, name: str, console: Consol
     return result
 
 
+def all_results(folder: Path) -> list[dict[str, Any]]:
+    """Whatever there is in a run, of earlier calls with other conditions, targets or methods too."""
+    files = [file for name in CONDITIONS for file in sorted((folder / name).glob("target_*.json"))]
+    return [json.loads(file.read_text(encoding="utf-8")) for file in files if not file.name.endswith(".truth.json")]
+
+
 def main(cfg: Config, console: Console | None = None) -> Path:
     """Compare on all targets, print and write the table; returns the run folder."""
     console = console or cli.console(160)
@@ -211,14 +217,15 @@ def main(cfg: Config, console: Console | None = None) -> Path:
     folder = cli.start_run(
         cfg, cfg.resume or cfg.runs / cfg.name, resume=cfg.resume is not None, recipe="easi_baselines"
     )
-    results: list[dict[str, Any]] = []
     with cli.interruptible() as interrupted:
         for index in range(cfg.targets):
             for name in cfg.conditions:
                 if not interrupted():
                     (folder / name).mkdir(exist_ok=True)
-                    results.append(compare_on(cfg, folder / name, index, name, console))
-    summary = summarize(results, cfg.methods)
+                    compare_on(cfg, folder / name, index, name, console)
+    results = all_results(folder)
+    methods = dict.fromkeys([*cfg.methods, *(method for result in results for method in result["methods"])])
+    summary = summarize(results, list(methods))
     cli.write_json(folder / "table.json", cli.to_json(summary))
     (folder / "table.md").write_text(markdown(summary), encoding="utf-8")
     print_table(console, summary)

@@ -189,8 +189,13 @@ def check(cfg: Config) -> Path:
             raise ValueError(
                 f"--{option} needs --collection replay: a roll-out of the policy has no matching transition"
             )
-    if cfg.generations < 1 or cfg.trajectory_length < 1 or cfg.noise < 0.0 or cfg.critic.updates < 1:
-        raise ValueError("expected --generations, --trajectory-length and --critic.updates from 1, and --noise from 0")
+    if cfg.generations < 1 or cfg.trajectory_length < 1 or cfg.critic.updates < 1:
+        raise ValueError("expected --generations, --trajectory-length and --critic.updates from 1")
+    if cfg.noise < 0.0 or cfg.latency < 0:
+        raise ValueError(f"expected --noise and --latency from 0, got {cfg.noise} and {cfg.latency}")
+    steps, _ = replay_window(cfg)
+    if cfg.collection == "replay" and not 1 <= steps <= cfg.trajectory_length:
+        raise ValueError(f"expected --window from 1 to --trajectory-length {cfg.trajectory_length}, got {steps}")
     return cfg.log
 
 

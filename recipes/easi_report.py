@@ -20,8 +20,9 @@ from agility_rl.collectors import EvolutionStrategy, ParameterSpace
 from agility_rl.record.plots import Curves, save_figure
 from agility_rl.training.cli import to_json, write_json
 
-NARROWED = 0.5
-"""A spread above this share of what chance alone would have left says that the log does not show the parameter."""
+TRIES, UNLUCKY = 60, 0.1
+"""Searches in which one parameter has no effect, and the share of its spreads there that a parameter must stay below:
+above it the log does not show it."""
 FULL_LIMIT, SURVIVOR_LIMIT = 0.8, 0.4
 """Correlations that are worth a warning: of a full covariance, and of the survivors of a diagonal one, whose parents
 are independent, so that every generation shows only what selection adds."""
@@ -35,7 +36,8 @@ class Identifiability:
 
     Attributes:
         spread: ``[D]``, standard deviation of the final distribution in shares of the first one's.
-        chance: what is left of it when scores are pure chance; survivors of a finite population drift together.
+        chance: median of what is left of it for a parameter that has no effect; survivors of a finite population
+            drift together.
         correlation: ``[D, D]``, of the final distribution, or mean of the survivors' with a diagonal one.
         warnings: a line for everything that should not be trusted.
     """
@@ -59,10 +61,9 @@ def survivor_correlation(search: EvolutionStrategy, individuals: Tensor, scores:
 
 
 def identify(search: EvolutionStrategy, space: ParameterSpace, survivors: Tensor) -> Identifiability:
-    r"""Compare the final distribution with the first one, and with what chance would have made of it.
+    """Compare the final distribution with the first one, and with what chance would have made of it.
 
-    Selection by chance shrinks a variance about the new mean by :math:`1 - \sum_r w_r^2` a generation, so that a
-    narrow distribution alone proves nothing.
+    Selection by chance narrows a distribution too, so that a narrow one alone proves nothing.
 
     Args:
         search: after its last generation.
@@ -70,18 +71,18 @@ def identify(search: EvolutionStrategy, space: ParameterSpace, survivors: Tensor
         survivors: ``[D, D]``, mean of :func:`survivor_correlation` over the generations.
     """
     first = (search.high - search.low) / math.sqrt(12.0)
-    spread = search.std / first
-    lost = float(search.weights.square().sum()) if search.centre == "new" else 0.0
-    chance = (1.0 - search.learning_rate * lost) ** (search.generation / 2)
+    spread, by_chance = search.std / first, spreads_by_chance(search)
+    chance, unlucky = float(by_chance.median()), float(by_chance.quantile(UNLUCKY))
     names, full = space.names, search.form == "full"
     correlation = search.correlation if full else survivors
     # Correlations of few survivors are large by themselves; several generations average that out.
     samples = len(search.weights) * (1 if full else max(1, search.generation))
     limit = max(FULL_LIMIT if full else SURVIVOR_LIMIT, 3.0 / math.sqrt(samples))
     warnings = [
-        f"{name}: the log hardly shows it ({float(spread[i]):.2f} of the first spread; chance leaves {chance:.2f})"
+        f"{name}: the log hardly shows it ({float(spread[i]):.2f} of the first spread; chance leaves {chance:.2f}, and "
+        f"less than {unlucky:.2f} in one of ten searches)"
         for i, name in enumerate(names)
-        if spread[i] > NARROWED * chance
+        if spread[i] > unlucky
     ]
     for i in range(len(names)):
         for j in range(i):
@@ -98,6 +99,24 @@ def identify(search: EvolutionStrategy, space: ParameterSpace, survivors: Tensor
                 f"{names[i]}: ends at the edge of its range; widen --search.span or give --search.no-bounded"
             )
     return Identifiability(spread, chance, correlation, tuple(warnings))
+
+
+def spreads_by_chance(search: EvolutionStrategy) -> Tensor:
+    """What as many generations leave of a parameter that has no effect, ``[TRIES]`` in shares of the first spread.
+
+    Each parameter in turn has none, while the search finds a place for the others: with a full covariance their
+    narrowing narrows the blind one too. A single parameter is judged by dice.
+    """
+    generator, width, found = torch.Generator().manual_seed(0), search.high - search.low, []
+    for number in range(TRIES):
+        other, seen = search.anew(generator), torch.ones(len(width), dtype=torch.float64)
+        seen[blind := number % len(width)] = 0.0
+        for _ in range(search.generation):
+            individuals = other.ask()
+            missed = (seen * ((individuals - search.low) / width - 0.4).square()).sum(-1)
+            other.tell(individuals, -missed - 1e-9 * torch.rand(len(missed), generator=generator))
+        found.append(math.sqrt(12.0) * other.std[blind] / width[blind])
+    return torch.stack(found)
 
 
 def physical(search: EvolutionStrategy, space: ParameterSpace) -> tuple[Tensor, Tensor]:

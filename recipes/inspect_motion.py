@@ -11,6 +11,7 @@ is 1. Gaits are named from foot phases, speed and trunk height, window by window
 
 from __future__ import annotations
 
+import itertools
 import re
 import sys
 from collections import Counter
@@ -27,6 +28,7 @@ from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.motion import MotionClip, MotionError, load_clip
 from agility_rl.motion.clip import save
 from agility_rl.motion.edit import foot_slip
+from agility_rl.motion.formats import motion_files
 from agility_rl.motion.gait_analysis import (
     GAIT_LABELS,
     GaitMeasurement,
@@ -37,9 +39,6 @@ from agility_rl.motion.gait_analysis import (
 from agility_rl.motion.gaits import synthesize_gait
 from agility_rl.record.plots import footfall_diagram, save_figure
 from agility_rl.training import cli
-
-SUFFIXES = (".json", ".txt", ".csv", ".pkl", ".npz", ".bvh")
-NOT_MOTION = re.compile(r"licen[cs]e|readme|_info(\.|$)|_pose\.txt$|sha256", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -89,11 +88,7 @@ def find_files(paths: tuple[Path, ...]) -> list[tuple[Path, str]]:
         if path.is_file():
             found.append((path, path.name))
             continue
-        files = [p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and not NOT_MOTION.search(p.name)]
-        if not files:
-            raise MotionError(f"{path}: expected motion files ({', '.join(SUFFIXES)}), found none in this folder")
-        files.sort(key=lambda p: [int(s) if s.isdigit() else s for s in re.split(r"(\d+)", p.as_posix())])
-        found += [(file, file.relative_to(path.parent).as_posix()) for file in files]
+        found += [(file, file.relative_to(path.parent).as_posix()) for file in motion_files(path)]
     return found
 
 
@@ -158,26 +153,29 @@ def draw(row: Inspection, name: str, config: Config) -> Path:
     return save_figure(footfall_diagram(contact, row.clip.dt, title=title), config.output / f"{name}.png")
 
 
-def write(row: Inspection, name: str, folder: Path) -> None:
-    """Store a clip as .npz.
+def write(rows: list[Inspection], names: list[str], folder: Path) -> None:
+    """Store clips as .npz.
 
     Raises:
-        MotionError: if the file exists.
+        MotionError: if one of the files exists; none is written then.
     """
-    target = folder / f"{name}.npz"
-    if target.exists():
-        raise MotionError(f"{target}: exists and is not overwritten; choose another --convert folder or remove it")
-    save(row.clip, target)
+    targets = [folder / f"{name}.npz" for name in names]
+    for target in targets:
+        if target.exists():
+            raise MotionError(f"{target}: exists and is not overwritten; choose another --convert folder or remove it")
+    for row, target in zip(rows, targets, strict=True):
+        save(row.clip, target)
 
 
 def unique_names(paths: list[str]) -> list[str]:
-    """File stems, made longer by their folders where two are alike."""
+    """File stems, made longer by their folders where two are alike, and by a number where these are alike too."""
     stems = [Path(path).stem for path in paths]
-    alike = Counter(stems)
-    return [
-        stem if alike[stem] == 1 else "-".join(Path(path).with_suffix("").parts)
-        for path, stem in zip(paths, stems, strict=True)
-    ]
+    alike, names = Counter(stems), list[str]()
+    for path, stem in zip(paths, stems, strict=True):
+        name = stem if alike[stem] == 1 else "-".join(Path(path).with_suffix("").parts)
+        further = (f"{name}-{number}" for number in itertools.count(2))
+        names.append(next(free for free in itertools.chain([name], further) if free not in names))
+    return names
 
 
 def main(config: Config, console: Console) -> int:
@@ -192,9 +190,13 @@ def main(config: Config, console: Console) -> int:
             try:
                 label = stem if stem in BEHAVIOURS else None
                 clip = load_clip(path, label=label, grounding=config.grounding or None)
-                rows.append(inspect(clip, name, config.window))
             except ValueError as error:
                 broken.append(str(error))
+                continue
+            try:
+                rows.append(inspect(clip, name, config.window))
+            except ValueError as error:
+                broken.append(f"{path}: {error}")
     else:
         console.print("No path given: these are the built-in synthetic gaits; no dog moved like this.")
         rows = [inspect(synthesize_gait(behaviour), behaviour, config.window) for behaviour in BEHAVIOURS]
@@ -215,8 +217,7 @@ def main(config: Config, console: Console) -> int:
         agreeing = sum(row.clip.label == row.gait for row in labelled)
         console.print(f"the gait agrees with the name of {agreeing} of {len(labelled)} clips named after a behaviour")
     if config.convert is not None:
-        for row, name in zip(rows, names, strict=True):
-            write(row, name, config.convert)
+        write(rows, names, config.convert)
         console.print(f"{len(rows)} clips written to {config.convert}")
     if config.figures and rows:
         for row, name in zip(rows, names, strict=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import Any, Literal
 
 import torch
@@ -104,9 +105,7 @@ class EvolutionStrategy:
         rank = torch.arange(1, survivors + 1, dtype=torch.float64)
         weights = math.log(survivors + 0.5) - rank.log()
         self.weights = weights / weights.sum()
-        self.mean = (self.low + self.high) / 2
-        self.covariance = torch.diag((self.high - self.low).square() / 12)  # of the uniform distribution
-        self.means = torch.empty(0, len(self.low), dtype=torch.float64)
+        self._begin()
 
     @property
     def generation(self) -> int:
@@ -138,6 +137,18 @@ class EvolutionStrategy:
         scale = self.std[:, None] * self.std
         correlation = torch.where(scale > 0, self.covariance / scale.clamp_min(1e-300), torch.zeros_like(scale))
         return correlation.fill_diagonal_(1.0)
+
+    def anew(self, generator: torch.Generator) -> EvolutionStrategy:
+        """The same search before its first generation, with random numbers of its own."""
+        other = copy(self)
+        other.generator = generator
+        other._begin()
+        return other
+
+    def _begin(self) -> None:
+        self.mean = (self.low + self.high) / 2
+        self.covariance = torch.diag((self.high - self.low).square() / 12)  # of the uniform distribution
+        self.means = torch.empty(0, len(self.low), dtype=torch.float64)
 
     def ask(self) -> Tensor:
         """Draw the individuals of a generation, float64 ``[N, D]``."""

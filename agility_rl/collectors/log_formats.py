@@ -5,7 +5,7 @@ A log is a table with one row a control step. Columns come in groups:
 ===================== ======= ============================= ====================================================
 group                 columns unit                          meaning
 ===================== ======= ============================= ====================================================
-time                  1       s                             increasing, at any origin
+time                  1       s                             increasing, at any origin (MCAP: from 0 on)
 joint_position        12      rad                           columns are the joints' names
 joint_velocity        12      rad/s                         columns are the joints' names
 roll_pitch            2       rad                           ``roll, pitch``; or a quaternion instead
@@ -92,7 +92,7 @@ def write_columns(path: str | Path, groups: Mapping[str, Tensor]) -> Path:
     """Write groups as :func:`read_columns` returns them; the file takes its name when it is complete.
 
     Raises:
-        RobotLogError: if the file type is another.
+        RobotLogError: if the file type is another, or cannot hold the times.
     """
     path = Path(path)
     if path.suffix not in SUFFIXES:
@@ -100,6 +100,10 @@ def write_columns(path: str | Path, groups: Mapping[str, Tensor]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     staged = path.with_name(f".{path.stem}.incoming{path.suffix}")
     arrays = {name: value.detach().cpu().numpy() for name, value in groups.items()}
+    if path.suffix == ".mcap" and (arrays["time"] < 0.0).any():
+        raise RobotLogError(
+            f"{path}: time begins at {arrays['time'].min():.3f} s, MCAP knows none before 0; shift it, or write .npz"
+        )
     {".mcap": _write_mcap, ".csv": _write_csv, ".npz": _write_npz}[path.suffix](staged, arrays)
     os.replace(staged, path)
     return path
@@ -135,8 +139,11 @@ def check_names(where: str, found: Sequence[str], expected: Sequence[str]) -> No
 
 # CSV -----------------------------------------------------------------------------------------------------------------
 def _read_csv(path: Path) -> dict[str, Any]:
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(file))
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.reader(file))
+    except UnicodeDecodeError as error:
+        raise RobotLogError(f"{path} is no text in UTF-8: {error}") from error
     if not rows:
         raise RobotLogError(f"{path} is empty")
     header = [name.strip() for name in rows[0]]

@@ -33,7 +33,7 @@ class RobotLog:
     """What a robot measured and did, one row a control step, checked when it is made.
 
     It holds only what a real robot knows: no trunk position and no trunk velocity. Columns, units and the three file
-    types are described in :mod:`agility_rl.collectors.log_formats`.
+    types are described in :mod:`agility_rl.collectors.log_formats`. Numbers are kept as float32, but for the time.
 
     Source: supplement S2 (4,000 steps at 50 Hz, about 80 seconds).
 
@@ -80,6 +80,10 @@ class RobotLog:
     min_steps: int = MIN_STEPS
 
     def __post_init__(self) -> None:
+        for group in GROUPS:  # NumPy's numbers are float64, those of networks and simulators float32
+            if (value := getattr(self, group, None)) is not None:
+                object.__setattr__(self, group, value.float())
+        object.__setattr__(self, "time", self.time.double())
         self._check_shapes()
         self._check_finite()
         if len(self) < max(self.min_steps, 2):

@@ -10,6 +10,7 @@ need not count.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -53,6 +54,7 @@ class Windows:
         measured: ``[W, H, 29]``, what the robot measured after each, latency taken out.
         scale: ``[29]``, expected error of a perfect model.
         skip: predictions of this many first steps do not count.
+        control_dt: for how long each action was held [s].
 
     Example:
         >>> time = constants.CONTROL_DT * torch.arange(100, dtype=torch.float64)
@@ -75,6 +77,7 @@ class Windows:
     measured: Tensor
     scale: Tensor
     skip: int
+    control_dt: float = constants.CONTROL_DT
 
     def __len__(self) -> int:
         return len(self.action)
@@ -118,21 +121,24 @@ def cut_windows(log: RobotLog, steps: int, *, skip: int = 0, noise: float = 0.0,
     """
     if not 0 <= skip < steps:
         raise ValueError(f"expected 0 <= skip < window, got {skip} and {steps} control steps")
+    if latency < 0:
+        raise ValueError(f"expected a latency from 0, got {latency} control steps")
+    needed = max(steps + 1, SMOOTHING[0] if noise else 0)
     measured = features.measurement(log.roll_pitch, log.angular_velocity, log.joint_position, log.joint_velocity)
     bounds = sorted({0, *log.start.nonzero()[:, 0].tolist(), len(log)})
     starts, firsts, actions, followings = [], [], [], []
     for first, last in pairwise(bounds):
         state, action = measured[first + latency : last], log.action[first:last]
-        if len(state) < max(steps + 1, SMOOTHING[0]):
+        if len(state) < needed:
             continue
-        start = smooth(state) if noise else state
+        start = smooth(state, log.control_dt) if noise else state
         for row in range(0, len(state) - steps, steps):
             starts.append(start[row])
             firsts.append(state[row])
             actions.append(action[row : row + steps])
             followings.append(state[row + 1 : row + steps + 1])
     if not starts:
-        raise ValueError(f"{log.name}: expected {steps + latency + 1} rows without a reset, found no such piece")
+        raise ValueError(f"{log.name}: expected {needed + latency} rows without a reset, found no such piece")
     missed = START_UNCERTAINTY * measured.std(0)
     deviation = noise * features.noise_scale(LAYOUT) / 3.0**0.5  # of uniform noise
     return Windows(
@@ -142,19 +148,18 @@ def cut_windows(log: RobotLog, steps: int, *, skip: int = 0, noise: float = 0.0,
         torch.stack(followings),
         (missed.square() + deviation.square()).sqrt().clamp_min(1e-6),
         skip,
+        log.control_dt,
     )
 
 
-def smooth(state: Tensor) -> Tensor:
+def smooth(state: Tensor, dt: float = constants.CONTROL_DT) -> Tensor:
     """Savitzky-Golay filter on every channel of measurements ``[T, 29]``; joint speeds are slopes of the positions."""
     from scipy.signal import savgol_filter  # takes a second to import, which everyone else should not pay
 
     rows, degree = SMOOTHING
     smoothed = savgol_filter(state.numpy(), rows, degree, axis=0)
     position, velocity = (features.layout_slice(LAYOUT, name) for name in ("joint_position", "joint_velocity"))
-    smoothed[:, velocity] = savgol_filter(
-        state[:, position].numpy(), rows, degree, deriv=1, delta=constants.CONTROL_DT, axis=0
-    )
+    smoothed[:, velocity] = savgol_filter(state[:, position].numpy(), rows, degree, deriv=1, delta=dt, axis=0)
     return torch.from_numpy(smoothed).float()
 
 
@@ -204,7 +209,15 @@ def predict(simulator: Simulator, space: ParameterSpace, individuals: Tensor, wi
 
     Returns:
         ``[P, W, H, 29]``, the measurements predicted, NaN where the simulation diverged.
+
+    Raises:
+        ValueError: if the simulator holds an action for another time than the robot did.
     """
+    if not math.isclose(windows.control_dt, simulator.control_dt):
+        raise ValueError(
+            f"the log holds an action for {windows.control_dt:g} s, the simulator for {simulator.control_dt:g} s; "
+            "make one with this control period"
+        )
     robots, values = simulator.num_simulations, space.denormalize(individuals)
     everyone, target = torch.ones(robots, dtype=torch.bool), windows.target
     # Everyone plays a window before the next begins: where robots are a multiple of individuals, every chunk has the

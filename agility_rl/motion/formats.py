@@ -25,7 +25,7 @@ FROM_GAIT = "from gait"
 """Label that stands for the behaviour the feet show; a clip that shows none of the five stays unlabelled."""
 
 _EXTENSIONS = (".json", ".txt", ".csv", ".pkl", ".npz", ".bvh")
-_NOT_MOTION = re.compile(r"license|readme|_info(\.|$)|_pose\.txt$|sha256", re.IGNORECASE)
+_NOT_MOTION = re.compile(r"licen[cs]e|readme|_info(\.|$)|_pose\.txt$|sha256", re.IGNORECASE)
 
 
 def label_from_name(path: str | Path) -> str:
@@ -89,7 +89,10 @@ def load_clip(
     if grounding is not None:
         clip = ground(clip, grounding)
     if label == FROM_GAIT:
-        gait = classify_gait(measure_clip(clip))
+        try:
+            gait = classify_gait(measure_clip(clip))
+        except ValueError as error:
+            raise MotionError(f"{path}: {error}") from error
         clip = replace(clip, label=gait if gait in BEHAVIOURS else None)
         clip = clip.with_notes(f"the feet show {gait}")
     return clip
@@ -120,10 +123,19 @@ def load_clips(
         raise MotionError(f"{path}: expected a motion file or a folder of them, found nothing; check the path")
     if path.is_file():
         return [load_clip(path, label=label, dt=dt, grounding=grounding)]
-    files = sorted((file for file in path.rglob("*") if _is_motion(file)), key=_natural)
+    return [load_clip(file, label=label, dt=dt, grounding=grounding) for file in motion_files(path)]
+
+
+def motion_files(folder: Path) -> list[Path]:
+    """Every motion file of a folder and its subfolders, sorted by path; licences, readmes and the like passed over.
+
+    Raises:
+        MotionError: if there is none.
+    """
+    files = sorted((file for file in folder.rglob("*") if _is_motion(file)), key=_natural)
     if not files:
-        raise MotionError(f"{path}: expected motion files ({', '.join(_EXTENSIONS)}), found none in this folder")
-    return [load_clip(file, label=label, dt=dt, grounding=grounding) for file in files]
+        raise MotionError(f"{folder}: expected motion files ({', '.join(_EXTENSIONS)}), found none in this folder")
+    return files
 
 
 def _is_motion(path: Path) -> bool:
@@ -150,9 +162,9 @@ def _read(path: Path) -> MotionClip:
         return read_bvh_clip(path)
     if suffix not in _EXTENSIONS:
         raise MotionError(f"{path}: no known motion format; expected one of {', '.join(_EXTENSIONS)}")
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
         start = file.read(64).lstrip()
-    if not start.startswith("{"):
+    if suffix != ".json" and not start.startswith("{"):
         from agility_rl.motion.keypoints import read_keypoint_clip
 
         return read_keypoint_clip(path)

@@ -9,6 +9,7 @@ Source: data notes, part B.2 (labelled clips, phases) and B.3 (classification ru
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import torch
@@ -26,6 +27,8 @@ GAIT_LABELS: tuple[str, ...] = (*BEHAVIOURS, "stand", "other")
 STAND = GAIT_LABELS.index("stand")
 OTHER = GAIT_LABELS.index("other")
 
+SHORTEST = 0.3
+"""A stretch shorter than this shows no gait [s] (ours)."""
 JUMP_PEAK = 0.42
 """A trunk that rises over this height [m] has jumped (data notes B.3; the tallest gait stays below 0.36 m)."""
 JUMP_RISE = 0.1
@@ -137,8 +140,8 @@ def measure_gait(
     """
     steps = root_height.shape[-1]
     _check_shapes(foot_position, foot_contact, root_height, linear_velocity, yaw_rate)
-    if steps * dt < 0.3:
-        raise ValueError(f"a gait needs at least 0.3 s, got {steps} frames of {dt} s = {steps * dt:.2f} s")
+    if steps * dt < SHORTEST:
+        raise ValueError(f"a gait needs at least {SHORTEST} s, got {steps} frames of {dt} s = {steps * dt:.2f} s")
     fore_aft = detrend(foot_position[..., 0].float())
     frequency, crosses = stride_spectrum(fore_aft, dt)
     phases = crosses.angle().abs() / (2 * torch.pi)
@@ -174,11 +177,11 @@ def measure_windows(
 ) -> GaitMeasurement:
     """Measure a long stretch piece by piece: arguments as :func:`measure_gait`, results ``[*B, W]``.
 
-    The stretch is cut into ``W`` equal pieces of about ``window`` seconds (one, if it is shorter), so that a robot that
+    The stretch is cut into ``W`` equal pieces of about ``window`` seconds, none below 0.3, so that a robot that
     changes its gait in between, or drifts in stride frequency, is not averaged into a gait that nobody showed.
     """
     steps = root_height.shape[-1]
-    count = max(1, round(steps * dt / window))
+    count = max(1, min(round(steps * dt / window), steps // math.ceil(SHORTEST / dt)))
     length = steps // count
 
     def cut(value: Tensor, trailing: int) -> Tensor:

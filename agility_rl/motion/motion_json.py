@@ -23,7 +23,7 @@ def read_frames(path: str | Path) -> tuple[float, Tensor]:
     """
     path = Path(path)
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, OSError) as error:
         raise MotionError(f"{path}: expected a JSON motion file, got {error}") from error
     if not isinstance(data, dict) or not {"Frames", "FrameDuration"} <= data.keys():

@@ -213,6 +213,17 @@ def test_the_search_resumes_bit_for_bit() -> None:
     assert second.generation == 7
 
 
+def test_a_search_anew_is_the_one_that_was_begun() -> None:
+    target = torch.tensor([0.2, 0.9])
+    done = strategy(seed=3)
+    search(done, target, 7)
+    state = done.state_dict()
+    other = done.anew(torch.Generator().manual_seed(3))
+    search(other, target, 7)
+    assert torch.equal(other.mean, done.mean) and torch.equal(other.covariance, done.covariance)
+    assert torch.equal(done.state_dict()["means"], state["means"]), "the first one is left alone"
+
+
 def test_errors() -> None:
     with pytest.raises(ValueError, match="lower <= low < high <= upper"):
         strategy(2, lower=[0.5, 0.0])

@@ -111,6 +111,11 @@ def test_text_and_torn_lines_in_csv(tmp_path: Path) -> None:
     path.write_text("time,roll_pitch.roll,roll_pitch.pitch\n0.0,1.0,1.0\n0.02,1.0")
     with pytest.raises(RobotLogError, match="row 1 has 2 values, expected 3"):
         read_columns(path)
+    path.write_text("time,roll_pitch.roll,roll_pitch.pitch\n0.0,1.0,1.0\n", encoding="utf-8-sig")
+    assert read_columns(path)["roll_pitch"].tolist() == [[1.0, 1.0]], "spreadsheets begin a file with a mark"
+    path.write_text("time,höhe\n0.0,1.0\n", encoding="latin-1")
+    with pytest.raises(RobotLogError, match=r"log.csv is no text in UTF-8"):
+        read_columns(path)
     path.write_text("")
     with pytest.raises(RobotLogError, match="is empty"):
         read_columns(path)
@@ -132,6 +137,14 @@ def test_npz_without_numbers_or_with_pickled_objects(tmp_path: Path) -> None:
     np.savez(path, joint_names=names, time=np.array([{}, {}], dtype=object))
     with pytest.raises(RobotLogError, match="damaged or no npz"):
         read_columns(path)
+
+
+def test_mcap_knows_no_time_before_zero(tmp_path: Path) -> None:
+    early = columns() | {"time": -1.0 + 0.02 * torch.arange(7, dtype=torch.float64)}
+    with pytest.raises(RobotLogError, match=r"time begins at -1.000 s, MCAP knows none before 0"):
+        write_columns(tmp_path / "log.mcap", early)
+    assert not list(tmp_path.iterdir())
+    assert torch.equal(read_columns(write_columns(tmp_path / "log.npz", early))["time"], early["time"])
 
 
 def test_an_mcap_row_without_its_action(tmp_path: Path) -> None:

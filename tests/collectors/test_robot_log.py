@@ -60,6 +60,13 @@ def test_transitions_by_hand() -> None:
     assert set(td.keys(True, True)) == {"measurement", "action", ("next", "measurement")}
 
 
+def test_numbers_of_numpy_become_those_of_networks() -> None:
+    groups = {name: value.double() for name, value in columns().items()}
+    log = RobotLog.from_columns(groups)
+    assert log.time.dtype == torch.float64
+    assert {value.dtype for value in log.transitions().values(True, True)} == {torch.float32}
+
+
 def test_a_quaternion_serves_as_orientation() -> None:
     groups = columns()
     roll, pitch = groups["roll_pitch"].unbind(-1)

@@ -117,6 +117,24 @@ def test_windows_that_do_not_fit_say_so(log: RobotLog) -> None:
         cut_windows(log, 5, skip=5)
     with pytest.raises(ValueError, match="expected 201 rows without a reset"):
         cut_windows(log, 200)
+    with pytest.raises(ValueError, match="expected a latency from 0, got -1"):
+        cut_windows(log, 5, latency=-1)
+
+
+def test_only_smoothing_asks_for_more_rows_than_a_window_has() -> None:
+    pieces = numbered(100, tuple(range(0, 100, 4)))
+    assert len(cut_windows(pieces, 3)) == 25
+    with pytest.raises(ValueError, match="expected 7 rows without a reset"):
+        cut_windows(pieces, 3, noise=1.0)
+
+
+def test_a_log_at_another_rate_is_replayed_at_its_own(simulate: Simulate) -> None:
+    log = numbered(100, ())
+    fast = replace(log, time=log.time / 2, control_dt=constants.CONTROL_DT / 2)
+    windows, individuals = cut_windows(fast, 50), torch.full((1, len(SPACE)), 0.5)
+    with pytest.raises(ValueError, match=r"holds an action for 0.01 s, the simulator for 0.02 s"):
+        predict(simulate(1), SPACE, individuals, windows)
+    assert predict(BatchSimulator(1, control_dt=0.01), SPACE, individuals, windows).shape == (1, 1, 50, 29)
 
 
 def test_the_true_state_and_parameters_reproduce_the_log(simulate: Simulate, swing: Any) -> None:

@@ -23,6 +23,7 @@ def folder(make_clip: ClipMaker, sixty_one_rows: Rows, write_json: Callable[...,
     write_json(sixty_one_rows(clip), "trot_9.json", 1 / 30)
     save(make_clip(label="jump"), tmp_path / "more" / "walk_1.npz")
     (tmp_path / "LICENSE.txt").write_text("do not read")
+    (tmp_path / "LICENCE.txt").write_text("do not read")
     (tmp_path / "README.md").write_text("nor this")
     return tmp_path
 
@@ -76,6 +77,22 @@ def test_one_broken_file_is_named(folder: Path, write_json: Callable[..., Path])
     write_json([[0.0] * 61, [0.0] * 13], "walk_2.json")
     with pytest.raises(MotionError, match=r"walk_2.json: frame 1 expected 61 columns, got 13"):
         load_clips(folder)
+
+
+def test_json_is_read_as_json_whatever_it_begins_with(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "trot_9.json").read_text()
+    marked = folder / "marked.json"
+    marked.write_text(text, encoding="utf-8-sig")
+    assert load_clip(marked).num_frames == 51
+    marked.write_text(f"[{text}]")
+    with pytest.raises(MotionError, match="expected a JSON object with 'Frames'"):
+        load_clip(marked)
+
+
+def test_a_clip_too_short_for_a_gait_is_named(tmp_path: Path, make_clip: ClipMaker) -> None:
+    path = save(make_clip(frames=11), tmp_path / "short.npz")
+    with pytest.raises(MotionError, match=r"short.npz: a gait needs at least 0.3 s, got 11 frames"):
+        load_clip(path, label="from gait")
 
 
 def test_the_papers_labelled_set(data: Path) -> None:

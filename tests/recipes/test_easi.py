@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -125,6 +126,17 @@ def test_ctrl_c_saves_what_a_resume_goes_on_from(
     assert read_scalars(folder)["score/best"][0].tolist() == [1, 2]
 
 
+def test_a_search_that_was_killed_before_its_first_checkpoint_begins_anew(
+    easi: ModuleType, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = easi.train(smoke(easi, log, tmp_path, "whole"))
+    cut = easi.train(smoke(easi, log, tmp_path, "cut"))
+    shutil.rmtree(cut / "checkpoints")
+    easi.train(replace(easi.PRESETS["smoke"], resume=cut, num_threads=1))
+    assert "has no checkpoint yet: it begins anew" in capsys.readouterr().out
+    assert (whole / "result.json").read_text() == (cut / "result.json").read_text()
+
+
 def test_another_log_is_no_resume(easi: ModuleType, log: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy.csv"
     copy.write_bytes(log.read_bytes())
@@ -186,6 +198,8 @@ def test_a_noisy_log_takes_longer_windows_and_a_wide_search(easi: ModuleType, lo
         (("--log", "{log}", "--collection", "policy", "--critic.no-matched"), "--search.response needs --collection"),
         (("--log", "{log}", "--search.response", "1.5"), "expected share from above 0 to 1"),
         (("--log", "{log}", "--search.averaged", "-1"), "expected averaged, a share of the generations"),
+        (("--log", "{log}", "--window", "0"), "expected --window from 1 to --trajectory-length 20, got 0"),
+        (("--log", "{log}", "--latency", "-1"), "expected --noise and --latency from 0, got 0.0 and -1"),
         (("--log", "{log}", "--window", "21"), "expected --window from 1 to --trajectory-length 20, got 21"),
         (("--log", "{log}", "--window", "3", "--skip", "3"), "0 <= skip < window, got 3 and 3"),
         (("--log", "{log}", "--critic.difference"), "relative to one state"),
@@ -251,7 +265,11 @@ def test_the_table_warns_of_what_the_log_does_not_tell(module: Module, form: str
     assert "thigh_stiffness" not in text
     sharp = searched(space, lambda x: -((x - 0.4) ** 2).sum(-1), form, report)
     assert sharp.warnings == ()
-    assert float(found.spread[3]) == pytest.approx(found.chance, rel=0.35)
+    dice = torch.Generator().manual_seed(1)
+    chance = [searched(space, lambda x: torch.rand(len(x), generator=dice), form, report) for _ in range(10)]
+    shown = [sum("hardly shows" in warning for warning in found.warnings) for found in chance]
+    assert sum(shown) >= 0.75 * 40, "nine of ten parameters of no effect are expected to be named"
+    assert 0.5 < float(found.spread[3]) / found.chance < 2.0
 
 
 def test_the_error_by_hand(module: Module) -> None:

@@ -154,7 +154,8 @@ def baselines(module: Module) -> ModuleType:
 def smoke(baselines: ModuleType, folder: Path, **changes: Any) -> Any:
     preset = baselines.PRESETS["smoke"]
     easi = replace(preset.easi, num_threads=1)
-    return replace(preset, runs=folder, name="run", steps=120, easi=easi, conditions=("clean",), **changes)
+    usual = {"runs": folder, "name": "run", "steps": 120, "easi": easi, "conditions": ("clean",)}
+    return replace(preset, **(usual | changes))
 
 
 def test_one_command_compares_and_a_resume_runs_nothing_twice(
@@ -205,6 +206,10 @@ def test_a_method_that_is_missing_is_run_alone_on_the_same_log(baselines: Module
     baselines.main(replace(smoke(baselines, tmp_path, methods=("uniform", "cma_es")), resume=folder))
     assert log.stat().st_mtime_ns == before
     assert list(json.loads((folder / "clean" / "target_00.json").read_text())["methods"]) == ["uniform", "cma_es"]
+    other = smoke(baselines, tmp_path, methods=("uniform",), conditions=("outside",))
+    baselines.main(replace(other, resume=folder))
+    rows = [(row["condition"], row["method"]) for row in json.loads((folder / "table.json").read_text())]
+    assert rows == [("clean", "uniform"), ("clean", "cma_es"), ("outside", "uniform")], "what was there stays"
 
 
 def test_targets_are_the_same_in_all_conditions_but_outside(baselines: ModuleType) -> None:

@@ -70,6 +70,21 @@ def test_without_a_path_the_synthetic_gaits_are_shown(recipe: ModuleType, screen
 
 def test_alike_names_are_told_apart(recipe: ModuleType) -> None:
     assert recipe.unique_names(["a/x.json", "b/x.json", "y.bvh"]) == ["a-x", "b-x", "y"]
+    assert recipe.unique_names(["x.json", "x.npz", "x.json"]) == ["x", "x-2", "x-3"]
+
+
+def test_files_of_one_name_from_two_folders_are_all_written(
+    recipe: ModuleType, screen: Console, clips: Path, tmp_path: Path
+) -> None:
+    paths = (clips / "trot_0.npz", save(synthesize_gait("walk", duration=0.56), tmp_path / "other" / "trot_0.npz"))
+    config = recipe.Config(paths=paths, output=tmp_path / "f", convert=tmp_path / "c", window=0.3)
+    assert recipe.main(config, screen) == 0
+    for folder, suffix in (("f", "png"), ("c", "npz")):
+        assert {path.name for path in (tmp_path / folder).iterdir()} == {f"trot_0.{suffix}", f"trot_0-2.{suffix}"}
+    (tmp_path / "c" / "trot_0.npz").unlink()
+    with pytest.raises(MotionError, match=r"trot_0-2.npz: exists and is not overwritten"):
+        recipe.main(config, screen)
+    assert not (tmp_path / "c" / "trot_0.npz").exists(), "all or none"
 
 
 def test_impossible_options_and_empty_folders(recipe: ModuleType, screen: Console, tmp_path: Path) -> None:
