@@ -28,6 +28,7 @@ from torch.nn import functional as F
 
 from agility_rl import keys
 from agility_rl.go2 import features
+from agility_rl.training.ppo import MEASURED
 
 NUM_SKILLS = 5
 PHASES = ("collect", "imitation", "policy", "adaptation")
@@ -243,13 +244,16 @@ class Plain:
             error = batch["reward"][step] + ppo.gamma * bootstrap - batch["value"][step]
             later = error + ppo.gamma * ppo.lmbda * later.masked_fill(batch["done"][step], 0.0)
             advantage[step] = later
-        names = (*CRITIC, *((keys.HISTORY,) if pull > 0.0 or ppo.critic_history else ()))
+        names = (*CRITIC, *((keys.HISTORY,) if ppo.critic_history else ()))
         flat = {name: batch[name].flatten(0, 1) for name in (*names, "estimate", "loc", "scale", "action", "log_prob")}
         flat["target"] = (advantage + batch["value"]).flatten()
         flat["advantage"], group = advantage.flatten(), batch[keys.SKILL].flatten() * ppo.by_behaviour
         for own in (group == index for index in group.unique()):
             deviation, mean = torch.std_mean(flat["advantage"][own])
             flat["advantage"][own] = (flat["advantage"][own] - mean) / (deviation + 1e-8)
+        if pull > 0.0:
+            with torch.no_grad():
+                flat["inferred"] = self.history(batch[keys.HISTORY].flatten(0, 1))
         count = self.steps * self.n
         for _ in range(ppo.epochs):
             for rows in torch.randperm(count, generator=self.generator).split(count // ppo.minibatches)[
@@ -264,15 +268,13 @@ class Plain:
                 loss = loss - ppo.entropy * scale.log().sum(-1).mean()
                 loss = loss + ppo.value * (self.value(seen) - seen["target"]).square().mean()
                 if pull > 0.0:
-                    with torch.no_grad():
-                        inferred = self.history(seen[keys.HISTORY])
-                    loss = loss + pull * (latent - inferred).norm(dim=-1).mean()
+                    loss = loss + pull * (latent - seen["inferred"]).norm(dim=-1).mean()
                 self.policy_optimizer.zero_grad(set_to_none=True)
                 loss.backward()
                 nn.utils.clip_grad_norm_(self.policy_parameters, ppo.max_grad_norm)
                 self.policy_optimizer.step()
             if ppo.desired_kl is not None:
-                self.adapt_learning_rate(seen)
+                self.adapt_learning_rate({name: x[:MEASURED] for name, x in seen.items()})
 
     @torch.no_grad()
     def adapt_learning_rate(self, seen: dict[str, Tensor]) -> None:
@@ -309,7 +311,8 @@ class Plain:
         self.update_imitation(iteration)
         marks.append(time.perf_counter())
         self.add_rewards(batch)
-        self.update_policy(batch, pull)
+        if not with_history:
+            self.update_policy(batch, pull)
         marks.append(time.perf_counter())
         self.update_adaptation(batch)
         marks.append(time.perf_counter())

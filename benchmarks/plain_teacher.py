@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 from agility_rl import keys
 from agility_rl.losses import functional
+from agility_rl.training.ppo import MEASURED
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes"))
 import tsc_teacher as recipe
@@ -150,7 +151,7 @@ class Plain:
             for rows in order.split(count // ppo.minibatches)[: ppo.minibatches]:
                 seen = {name: entry[rows] for name, entry in flat.items()}
                 self.descend(seen)
-            self.adapt(seen)
+            self.adapt({name: entry[:MEASURED] for name, entry in seen.items()})
 
     def descend(self, seen: dict[str, Tensor]) -> None:
         ppo = self.cfg.ppo

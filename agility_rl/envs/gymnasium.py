@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite
 
 from agility_rl import keys
 from agility_rl.envs.locomotion import LocomotionEnv
@@ -56,8 +57,8 @@ class LocomotionVectorEnv(VectorEnv):
 
     Raises:
         ModuleNotFoundError: at import, if Gymnasium is not installed.
-        ValueError: if a group is unknown or not float32, the limit is not positive, or ``env`` holds another number of
-            robots.
+        ValueError: if there is no group or one is unknown or not float32, the limit is not positive, or ``env`` holds
+            another number of robots.
 
     Example:
         >>> import gymnasium
@@ -92,6 +93,8 @@ class LocomotionVectorEnv(VectorEnv):
         self.env = LocomotionEnv(num_envs, **options) if env is None else env
         self.num_envs = num_envs
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        if not groups:
+            raise ValueError("expected at least one observation group, got none; leave groups out for the usual ones")
         self.groups = tuple(groups)
         self.single_observation_space = gymnasium.spaces.Dict({name: self._space(name) for name in self.groups})
         actions = self.env.action_spec.shape[1:]
@@ -103,7 +106,8 @@ class LocomotionVectorEnv(VectorEnv):
         self._ended = torch.zeros(num_envs, dtype=torch.bool)
 
     def _space(self, name: str) -> gymnasium.spaces.Box:
-        shown = {key: spec for key, spec in self.env.observation_spec.items() if spec.dtype == torch.float32}
+        specs = self.env.observation_spec.items()
+        shown = {key: spec for key, spec in specs if spec.dtype == torch.float32 and not isinstance(spec, Composite)}
         if name not in shown:
             raise ValueError(f"{name!r} is no float32 observation group; expected some of {', '.join(sorted(shown))}")
         return gymnasium.spaces.Box(-np.inf, np.inf, tuple(shown[name].shape[1:]), np.float32)
@@ -114,13 +118,15 @@ class LocomotionVectorEnv(VectorEnv):
         """Start new episodes, of all robots or of those in a mask.
 
         Args:
-            seed: seed of all further randomness.
+            seed: seed of all further randomness; without one it goes on from that of ``LocomotionEnv(seed=...)``, 0.
             options: ``{"reset_mask": bool array [N]}`` to reset only these robots.
 
         Raises:
             ValueError: if the mask is no bool array ``[N]`` with a set row, or names only some robots before the first
                 full reset.
+            gymnasium.error.ClosedEnvironmentError: after :meth:`close`.
         """
+        self._check_open()
         super().reset(seed=seed)
         if seed is not None:
             self.env.generator.manual_seed(seed)
@@ -151,8 +157,10 @@ class LocomotionVectorEnv(VectorEnv):
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset, or with ``DISABLED`` after an episode's end.
+            gymnasium.error.ClosedEnvironmentError: after :meth:`close`.
             ValueError: if the actions have another shape.
         """
+        self._check_open()
         action = torch.as_tensor(np.asarray(actions, dtype=np.float32))
         if action.shape != self.env.action_spec.shape:
             raise ValueError(f"expected actions of shape {self.action_space.shape}, got {tuple(action.shape)}")
@@ -179,6 +187,10 @@ class LocomotionVectorEnv(VectorEnv):
             self._begin(starting)
         infos |= self._terms(after, ~starting)
         return self._numpy(), reward.numpy(), terminated.numpy(), truncated.numpy(), infos
+
+    def _check_open(self) -> None:
+        if self.closed:
+            raise gymnasium.error.ClosedEnvironmentError("the robots were closed; make the environment anew")
 
     def _begin(self, mask: Tensor) -> None:
         """Start episodes of the rows of a bool mask, and leave the observations of the others as they are."""

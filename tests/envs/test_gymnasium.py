@@ -218,7 +218,8 @@ def test_actions_beyond_the_limit_are_clipped(make: Make) -> None:
     one, two = make(action_limit=1.0), make(action_limit=1.0)
     one.reset(seed=0)
     two.reset(seed=0)
-    assert_same(one.step(np.full((N, 12), 50.0))[0], two.step(np.ones((N, 12)))[0])
+    for sign in (1.0, -1.0):
+        assert_same(one.step(np.full((N, 12), 50.0 * sign))[0], two.step(np.full((N, 12), sign))[0])
 
 
 def test_writing_into_an_observation_does_not_reach_the_robots(make: Make) -> None:
@@ -238,6 +239,8 @@ def test_writing_into_an_observation_does_not_reach_the_robots(make: Make) -> No
             r"'vision' is no float32 observation group; expected some of .*motion",
         ),
         ({"groups": ["skill"]}, "'skill' is no float32 observation group"),
+        ({"groups": ["reward_terms"]}, "'reward_terms' is no float32 observation group"),
+        ({"groups": []}, "expected at least one observation group, got none"),
         ({"action_limit": 0.0}, "expected an action_limit above 0 action units, got 0.0"),
         ({"autoreset_mode": "Never"}, "'Never' is not a valid AutoresetMode"),
     ],
@@ -259,6 +262,15 @@ def test_bad_calls_are_refused(make: Make) -> None:
             envs.reset(options={"reset_mask": mask})
     with pytest.raises(ValueError, match="a ready env of 3 robots was given, with num_envs=2"):
         LocomotionVectorEnv(2, env=envs.env)
+
+
+def test_who_was_closed_says_so(make: Make) -> None:
+    envs = make()
+    envs.reset(seed=0)
+    envs.close()
+    for call in (envs.reset, lambda: envs.step(actions(1)[0])):
+        with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="make the environment anew"):
+            call()
 
 
 def test_without_gymnasium_the_package_works_and_the_adapter_says_what_to_install() -> None:
