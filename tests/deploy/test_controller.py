@@ -68,6 +68,17 @@ def test_a_run_follows_the_policy_from_a_fresh_memory(running: Running, deployed
     assert torch.equal(deployed.act(first.behaviour), first.action)
 
 
+def test_a_run_ends_without_a_jerk(running: Running, bus: FakeBus) -> None:
+    controller = running()
+    bend(bus, joint_position=torch.tensor(constants.DEFAULT_POSE) + 0.2)
+    controller.request(Mode.STAND_UP)
+    targets = torch.stack([controller.step().command.position for _ in range(30)])
+    assert torch.equal(targets[0], bus.state.joint_position)
+    # 0.2 rad in the 0.5 s to settle are 0.008 rad in each of its 25 steps.
+    assert (targets[1:] - targets[:-1]).abs().max() == pytest.approx(0.008, abs=1e-4)
+    assert torch.allclose(targets[25:], torch.tensor(constants.DEFAULT_POSE))
+
+
 def test_only_listed_requests_are_granted(controller: Controller, running: Running) -> None:
     controller.request(Mode.RUN)
     assert controller.step().mode is Mode.PASSIVE
@@ -215,12 +226,20 @@ def test_every_fault_ends_in_damping(name: str, running: Running, bus: FakeBus) 
         assert controller.step().mode is Mode.DAMPING and is_damping(bus.sent[-1])
 
 
-def test_faults_while_standing_up_end_in_damping_too(controller: Controller, bus: FakeBus) -> None:
+@pytest.mark.parametrize("mode", [Mode.STAND_UP, Mode.READY])
+@pytest.mark.parametrize("check", ["stale state", "commanded torque"])
+def test_faults_of_a_robot_that_stands_end_in_damping_too(
+    mode: Mode, check: str, controller: Controller, bus: FakeBus
+) -> None:
     controller.request(Mode.STAND_UP)
-    for _ in range(10):
+    while controller.mode is not mode:
         controller.step()
-    bus.age = 0.1
+    if check == "stale state":
+        bus.age = 0.06
+    else:  # a thigh is 2.1 rad off where it was told to be: 40 N m/rad ask for 84 N m, the limit is 4 x 20
+        bend(bus, joint_position=torch.tensor((0.0, 3.0, -1.8) * 4))
     assert controller.step().mode is Mode.DAMPING and is_damping(bus.sent[-1])
+    assert controller.fault is not None and controller.fault.check == check
 
 
 def test_one_late_state_or_step_is_forgiven(running: Running, bus: FakeBus, clock: ManualClock) -> None:
@@ -245,6 +264,16 @@ def test_after_a_fault_it_can_stand_up_again(running: Running, bus: FakeBus) -> 
     controller.step()
     controller.request(Mode.STAND_UP)
     assert controller.step().mode is Mode.STAND_UP
+
+
+def test_what_was_too_fast_before_a_fault_does_not_count_again(running: Running, bus: FakeBus) -> None:
+    controller = running()
+    bend(bus, joint_velocity=torch.full((12,), 31.0))
+    while controller.mode is Mode.RUN:
+        controller.step()
+    for mode in (Mode.PASSIVE, Mode.STAND_UP):
+        controller.request(mode)
+        assert controller.step().mode is mode, controller.events[-1]
 
 
 def test_run_ends_in_damping_also_when_something_breaks(running: Running, bus: FakeBus) -> None:
@@ -308,11 +337,12 @@ def test_the_commander_sees_what_the_networks_see(running: Running) -> None:
             return {"depth": controller.clock.now()}
 
     controller.commander = Task()
-    controller.request(Mode.STAND_UP)
-    for _ in range(60):
-        controller.step()
-    controller.request(Mode.RUN)
-    assert [controller.step().behaviour.name for _ in range(4)] == ["walk", "walk", "jump", "jump"]
+    for _ in range(2):
+        controller.request(Mode.STAND_UP)
+        for _ in range(60):
+            controller.step()
+        controller.request(Mode.RUN)
+        assert [controller.step().behaviour.name for _ in range(4)] == ["walk", "walk", "jump", "jump"]
     assert seen[0].proprioception.shape == (45,) and not seen[0].estimate.any() and seen[1].estimate.any()
     assert seen[0].state.joint_position.shape == (12,)
 

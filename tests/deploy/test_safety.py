@@ -77,6 +77,17 @@ def test_swapped_joints_are_found_by_name_and_by_their_stops() -> None:
     assert checks.check_state(state(joint_position=by_link), 0.0).check == "joint limits"
 
 
+def test_how_much_is_forgiven_by_default() -> None:
+    upper = constants.JOINT_UPPER[2]
+    for position, length, fine in ((upper + 0.2, 0.96, True), (upper + 0.3, 1.0, False), (upper, 0.94, False)):
+        changed = state(joint_position=joints(2, position), quaternion=torch.tensor([length, 0.0, 0.0, 0.0]))
+        assert (Safety(SafetyLimits()).check_state(changed, now=0.0) is None) == fine, (position, length)
+    for ahead, fine in ((0.4, True), (0.6, False)):
+        assert (Safety(SafetyLimits()).check_loop(1.0, {"depth": 1.0 + ahead}, 0) is None) == fine, ahead
+    checks, fast = Safety(SafetyLimits()), state(joint_velocity=1.01 * torch.tensor(constants.VELOCITY_LIMIT))
+    assert [checks.check_state(fast, now=0.0) is None for _ in range(5)] == [True] * 4 + [False]
+
+
 def test_speed_and_torque_must_last() -> None:
     limits = SafetyLimits(sustained=3)
     for entry, unit, limit in (

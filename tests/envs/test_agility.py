@@ -13,7 +13,7 @@ from torchrl.envs.utils import check_env_specs
 from agility_rl import keys
 from agility_rl.envs import COURSES, AgilityEnv
 from agility_rl.envs.agility import COURSE_RANDOMIZATION
-from agility_rl.envs.agility_rewards import AGILITY_REWARDS
+from agility_rl.envs.agility_rewards import AGILITY_REWARDS, AgilityTerm
 from agility_rl.simulation import make_simulator
 
 Build = Callable[..., AgilityEnv]
@@ -298,12 +298,15 @@ def test_state_dict_restores_the_exact_continuation(build: Build) -> None:
 @pytest.mark.filterwarnings("ignore")
 def test_a_broken_state_terminates_and_stays_finite(build: Build, tmp_path: Any, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)  # the engine writes MUJOCO_LOG.TXT
-    env = build(3, decision_steps=2)
+    rewards = {**AGILITY_REWARDS, "alive": AgilityTerm(1.0, lambda state: torch.ones(3))}
+    env = build(3, decision_steps=2, rewards=rewards)
     carrier = run(env, 2)[1]
     env.simulator.batch.bind("qpos")[1, 9] = float("nan")  # type: ignore[attr-defined]
     full, carrier = env.step_and_maybe_reset(carrier.set(keys.ACTION, decide(3, 0)))
     after = full["next"]
     assert after["terminated"][1] and after[keys.TERMINATIONS, "diverged"][1] and not after["truncated"][1]
+    assert after["reward"][1].item() == pytest.approx(-50.0 * 0.02), "the punishment alone"
+    assert after[keys.REWARD_TERMS, "alive"][:, 0].tolist() == pytest.approx([0.04, 0.0, 0.04])
     for td in (after, carrier, *run(env, 5, carrier)[0]):
         assert all(bool(torch.isfinite(value).all()) for value in td.values(True, True))
 
@@ -313,6 +316,19 @@ def test_many_random_steps_stay_finite_and_drop_nobody_through_the_floor(build: 
     seen = torch.stack(run(env, 200)[0])
     assert all(bool(torch.isfinite(value).all()) for value in seen.values(True, True))
     assert not seen["next", keys.TERMINATIONS, "sunk"].any() and not seen["next", keys.TERMINATIONS, "diverged"].any()
+
+
+def test_pushes_set_the_trunk_velocity(build: Build) -> None:
+    """In an interval of five control steps, each robot is pushed once."""
+    env = build(20, lambda td: td.set(keys.ACTION, torch.zeros(20, 12)), course=COURSES["tunnel"], push_interval=0.1)
+    carrier = env.reset()
+    phases = env.state_dict()["push_phase"]
+    for step in range(5):
+        before = env.simulator.root_linear_velocity
+        carrier = env.step(carrier.set(keys.ACTION, decide(20, step)))["next"]
+        jump = (env.simulator.root_linear_velocity - before)[:, :2].norm(dim=-1)
+        due = (step + phases) % 5 == 4
+        assert jump[due].mean() > max(0.1, 4 * jump[~due].mean())
 
 
 def test_wrong_arguments_are_refused(build: Build) -> None:

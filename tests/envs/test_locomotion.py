@@ -207,12 +207,13 @@ def test_a_broken_state_terminates_and_stays_finite(
     build: Build, value: float, tmp_path: Any, monkeypatch: Any
 ) -> None:
     monkeypatch.chdir(tmp_path)  # the engine writes MUJOCO_LOG.TXT
-    env = build(3)
+    env = build(3, rewards={**LOCOMOTION_REWARDS, "alive": RewardTerm(1.0, lambda state: torch.ones(3))})
     carrier = run(env, 3)[1]
     env.simulator.batch.bind("qpos")[1, 9] = value
     full, carrier = env.step_and_maybe_reset(carrier.set(keys.ACTION, torch.zeros(3, 12)))
     after = full["next"]
     assert after["terminated"][1] and not after["truncated"][1] and after["reward"][1] == 0
+    assert after[keys.REWARD_TERMS, "alive"][:, 0].tolist() == pytest.approx([0.02, 0.0, 0.02])
     assert not after["terminated"][[0, 2]].any()
     assert finite(after) and finite(carrier)
     for step in run(env, 10, carrier)[0]:

@@ -62,10 +62,10 @@ def test_explicit_and_peak_by_hand(neutral: Neutral, groups: ObservationGroups, 
 
 
 def test_measurements_are_clipped(neutral: Neutral, groups: ObservationGroups, commands: CommandSampler) -> None:
-    state = neutral(action=torch.full((2, 12), 1e9))
+    state = neutral(action=torch.tensor([[1e9], [-1e9]]).expand(2, 12))
     groups.reset(BOTH, state)
     seen = groups.build(state, commands, torch.zeros(2, 29))[keys.PROPRIOCEPTION]
-    assert seen.max() == 100.0
+    assert seen.max() == 100.0 and seen.min() == -100.0
 
 
 def test_a_contact_is_seen_one_step_longer(neutral: Neutral, groups: ObservationGroups) -> None:

@@ -34,6 +34,13 @@ def test_two_measurements_are_as_one_of_their_weighted_mean() -> None:
     torch.testing.assert_close(variance[0], 1.0 / weights.sum(), rtol=1e-3, atol=0.0)
 
 
+def test_half_of_a_right_angle_is_still_a_unit_vector() -> None:
+    """As sure as what is said: half-way between ahead and to the left, where sine and cosine are sqrt(1/2)."""
+    said, variance = torch.tensor([2.0, 0.0, 1.0, 0.0]), torch.full((3,), 0.02)
+    place, _ = corrected(HERE, variance, said, variance)
+    torch.testing.assert_close(place, torch.tensor([2.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]))
+
+
 def test_what_is_said_of_a_place_far_away_hardly_counts() -> None:
     distances = torch.tensor([0.0, 0.5, 1.0, 2.0])
     said = HERE + distances[:, None] * torch.tensor([0.6, 0.8, 0.0, 0.0])

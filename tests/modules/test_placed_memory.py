@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from agility_rl.envs.course_presets import COURSES
-from agility_rl.go2 import features
+from agility_rl.go2 import camera, features
 from agility_rl.modules.placed_memory import ALIKE, DRIFT, NEXT, START, PlacedMemory
 from agility_rl.modules.planar import moved
+from agility_rl.modules.scan_matching import NOTHING, ScanMatcher
 
 POINTS = torch.tensor([-1.5, -0.5, 0.5, 1.5])[:, None] * torch.tensor([1.0, 0.0]).expand(7, 1, 2)
 
@@ -93,6 +94,23 @@ def test_a_match_corrects_what_a_glance_has_left() -> None:
     torch.testing.assert_close(place[0, 4:], torch.tensor([-0.9, 0.0, 0.0, 1.0]), atol=2e-4, rtol=0.0)
     torch.testing.assert_close(after[0, 12:15] + torch.tensor(START), variance / 2.0, rtol=2e-3, atol=0.0)
     assert torch.equal(match, seen[3])
+
+
+@torch.no_grad()
+def test_what_is_matched_is_the_shape_of_the_likeliest_obstacle() -> None:
+    """A block begins 1.6 m before the camera, so its middle is 2.305 m ahead; all other obstacles are pebbles."""
+    upright = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0)
+    block, pebble = (("box", size, (0.0, 0.0, size[2]), *upright) for size in ((0.4, 1.4, 0.8), (0.02, 0.02, 0.02)))
+    ground = (0.27 + camera.POSITION[2]) / (-camera.pixel_directions()[..., 2]).clamp(min=1e-6)
+    image = camera.normalize_depth(ground.clamp(max=1.6))[None]
+    for likeliest, there in ((3, True), (0, False)):
+        memory, bias = silent()
+        memory.matcher = ScanMatcher([[pebble]] * 3 + [[block]] + [[pebble]] * 3)
+        bias["obstacle"][likeliest] = 20.0
+        feature, proprioception, _, _, hidden = still(memory, [-2.2, 0.0, 0.0, 1.0], 1)
+        *_, match = memory.step(feature, proprioception, torch.tensor([[0.27, 0.0, 0.0, 0.0]]), image, hidden)
+        assert bool(match[0, 4] < NOTHING) == there
+        assert (match[0, 0].item() == pytest.approx(2.305, abs=0.01)) == there
 
 
 @torch.no_grad()
@@ -198,7 +216,8 @@ def test_evidence_speaks_for_another_obstacle_only_where_the_robot_can_be() -> N
     for x, y, at, moves in (
         (0.5, 3.0, 0, False),  # before the first
         (2.0, 3.0, 2, False),  # at it; its last way-point is 1.5 m on
-        (3.2, 3.0, 3, True),
+        (2.85, 3.0, 3, False),  # 0.65 m before its last way-point
+        (2.95, 3.0, 3, True),
         (8.2, 4.0, 8, True),  # on the way to the third
         (8.2, 4.0, 9, False),
     ):
@@ -256,3 +275,19 @@ def test_gradients_reach_what_was_said_earlier() -> None:
     place[5].sum().backward()
     assert (feature.grad[3:].abs().sum(-1) > 0).all() and (feature.grad[:3, 1].abs().sum(-1) > 0).all()
     assert (feature.grad[:3, 0] == 0).all(), "an episode does not remember the one before it"
+
+
+def test_the_place_teaches_neither_the_obstacle_nor_what_was_expected_of_it() -> None:
+    """The way-points of the likeliest obstacle are known, and the terrain is not what a place is learned from."""
+    points = POINTS + torch.arange(7.0)[:, None, None]
+    memory = PlacedMemory(32, 45, 8, 7, 0.04, points)
+    torch.nn.init.normal_(memory.glance.correction[-1].weight)
+    hidden = torch.randn(2, memory.size, requires_grad=True)
+    seen = torch.randn(2, 32), torch.randn(2, 45), torch.randn(2, 4), torch.zeros(2, 58, 87)
+    latent, _, _, _, place, _, _ = memory.step(*seen, hidden)
+    place.sum().backward(retain_graph=True)
+    gradient = memory.head[0].weight.grad
+    assert (gradient[32:39] == 0).all() and gradient[43:46].any(), "of the obstacle, and of how alike images are"
+    hidden.grad = None
+    latent.sum().backward()
+    assert hidden.grad[:, :8].any() and (hidden.grad[:, 8:] == 0).all()

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -8,13 +10,14 @@ from agility_rl import keys
 from agility_rl.envs import AgilityEnv
 from agility_rl.envs.course_presets import COURSES
 from agility_rl.envs.obstacles import OBSTACLES
-from agility_rl.go2 import camera
+from agility_rl.go2 import camera, features
 from agility_rl.modules.planar import inverted
-from agility_rl.modules.scan_matching import FLOOR, NOTHING, ScanMatcher, inverted_spd
+from agility_rl.modules.scan_matching import FLOOR, NOTHING, ScanMatcher, _placed, _seen_variance, inverted_spd
 
 ROBOTS = 24
 SOLIDS = [kind.solids() for kind in OBSTACLES.values()]
 TAUGHT = [name for name in OBSTACLES if name != "box_jump"]
+BLOCK = ("box", (0.4, 1.4, 0.8), (0.0, 0.0, 0.8), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -73,10 +76,48 @@ def test_an_obstacle_is_found_where_it_stands(matcher: ScanMatcher, name: str, n
 
 def test_who_sees_nothing_is_told_nothing(matcher: ScanMatcher) -> None:
     (_, proprioception, estimate), seen, kind = standing("tunnel")
+    estimate[:, 1] = 3.0 * features.LINEAR_VELOCITY_SCALE  # where it was expected, however fast the robot is
     far = torch.full((ROBOTS, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH), 0.5)
     match = matcher(far, proprioception, estimate, seen, kind)
     assert (match[:, 4:] == NOTHING).all()
     torch.testing.assert_close(match[:, :4], seen, atol=1e-4, rtol=0.0)
+
+
+def test_an_image_is_one_frame_old(matcher: ScanMatcher) -> None:
+    """In 0.02 s, 3 m/s forward are 0.06 m, by which all is nearer now, and 2 rad/s of roll or pitch are 0.04 rad."""
+    (depth, proprioception, estimate), seen, kind = standing("tunnel")
+    expected = beside(seen)
+    still = matcher(depth, proprioception, estimate, expected, kind)
+    moving, nearer = estimate.clone(), torch.tensor([0.06, 0.0, 0.0, 0.0])
+    moving[:, 1] = 3.0 * features.LINEAR_VELOCITY_SCALE
+    match = matcher(depth, proprioception, moving, expected - nearer, kind)
+    torch.testing.assert_close(match[:, :4], still[:, :4] - nearer, atol=1e-4, rtol=0.0)
+    for axis in (0, 1):
+        leaning = proprioception.clone()
+        leaning[:, axis] += 0.04
+        leaning[:, 2 + axis] += 2.0 * features.ANGULAR_VELOCITY_SCALE
+        match = matcher(depth, leaning, estimate, expected, kind)
+        torch.testing.assert_close(match[:, :4], still[:, :4], atol=1e-4, rtol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("expected", "columns", "counts"), [(2.3, 40, True), (2.3, 20, False), (3.0, 87, True), (3.2, 87, False)]
+)
+def test_what_explains_too_little_or_lies_too_far_off_does_not_count(
+    expected: float, columns: int, counts: bool
+) -> None:
+    """A block begins 1.6 m before the camera, so its middle is 2.305 m ahead; something else hides columns of it.
+
+    40 columns of 87 are 46 % of what is seen, 20 are 23 %: 30 % must be explained. It may lie 0.8 m off.
+    """
+    depth = torch.full((camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH), 0.8)
+    depth[:, :columns] = 1.6
+    ground = (0.27 + camera.POSITION[2]) / (-camera.pixel_directions()[..., 2]).clamp(min=1e-6)
+    image = camera.normalize_depth(torch.minimum(ground, depth))[None]
+    still, standing, place = torch.zeros(1, 45), torch.tensor([[0.27, 0.0, 0.0, 0.0]]), [[expected, 0.0, 0.0, 1.0]]
+    match = ScanMatcher([[BLOCK]])(image, still, standing, torch.tensor(place), torch.tensor([0]))[0]
+    assert match[0].item() == pytest.approx(2.305, abs=0.01)
+    assert bool((match[4:] < NOTHING).all()) == counts
 
 
 def test_another_obstacle_is_not_taken_for_it(matcher: ScanMatcher) -> None:
@@ -96,6 +137,32 @@ def test_rows_do_not_mix_and_stored_images_say_the_same(matcher: ScanMatcher) ->
     stored = matcher(camera.quantize(depth, 16), proprioception, estimate, expected, kind)
     assert errors(stored, match).median() < 1e-3
     assert not matcher(depth.requires_grad_(), proprioception, estimate, expected, kind).requires_grad
+
+
+def test_points_are_placed_by_hand() -> None:
+    """Roll lifts what is to the left, pitch lowers what is ahead, yaw turns that to the left; then comes the shift."""
+    sine, cosine = math.sin(0.1), math.cos(0.1)
+    for angle, point, turned in (
+        (5, (0.0, 1.0, 0.0), (0.0, cosine, sine)),
+        (4, (1.0, 0.0, 0.0), (cosine, 0.0, -sine)),
+        (2, (1.0, 0.0, 0.0), (cosine, sine, 0.0)),
+    ):
+        pose = torch.tensor([[-2.0, 0.5, 0.0, 0.3, 0.0, 0.0, 0.0]])
+        pose[0, angle] = 0.1
+        here, _ = _placed(pose, torch.tensor([[point]]), torch.zeros(1, 1, 3))
+        torch.testing.assert_close(here[0, 0], torch.tensor(turned) + torch.tensor([-2.0, 0.5, 0.3]))
+
+
+def test_who_is_unsure_of_the_yaw_is_unsure_of_what_is_far() -> None:
+    """An obstacle 2 m ahead and 0.5 m to the left: a yaw of variance 0.01 moves it by 0.5 along and by 2 across.
+
+    With x and y that are as unsure and err with the yaw, 0.01 - 2 * 0.5 * 0.004 + 0.0025, 0.01 + 2 * 2 * 0.002 + 0.04.
+    """
+    robot, seen = torch.tensor([[-2.0, -0.5, 0.0, 1.0]]), torch.tensor([[2.0, 0.5, 0.0, 1.0]])
+    yaw = torch.diag(torch.tensor([0.0, 0.0, 0.01]))
+    together = torch.tensor([[0.01, 0.0, 0.004], [0.0, 0.01, 0.002], [0.004, 0.002, 0.01]])
+    for covariance, variance in ((yaw, [0.0025, 0.04, 0.01]), (together, [0.0085, 0.058, 0.01])):
+        torch.testing.assert_close(_seen_variance(covariance[None], robot, seen)[0], torch.tensor(variance))
 
 
 def test_inverse_of_badly_scaled_matrices() -> None:

@@ -55,9 +55,11 @@ def test_tensors_and_tensordicts_are_restored_in_place(tmp_path: Path) -> None:
     checkpoint = RunCheckpoint(tmp_path, tensor=tensor, replay=replay, mapping=mapping)
     checkpoint.save(0)
     tensor.zero_(), replay.zero_(), alias.zero_(), deep.zero_()
+    mapping["since"] = mapping["deep"]["since"] = 1
     checkpoint.load()
     assert tensor.tolist() == [0, 1, 2, 3] and (replay == before).all()
     assert alias.tolist() == [1, 1] and deep.tolist() == [1, 1, 1], "the same tensors, not new ones"
+    assert list(mapping) == ["buffer", "deep"] and list(mapping["deep"]) == ["buffer"], "nothing that came since"
 
 
 def train(folder: Path, iterations: int, resume: bool) -> dict[str, bytes]:
@@ -187,6 +189,11 @@ def test_errors_say_what_to_do(tmp_path: Path) -> None:
     RunCheckpoint(tmp_path / "tensor", value=torch.zeros(2)).save(1)
     with pytest.raises(CheckpointError, match=r"expected torch.float32 \(3,\), got torch.float32 \(2,\)"):
         RunCheckpoint(tmp_path / "tensor", value=torch.zeros(3)).load()
+    RunCheckpoint(tmp_path / "keys", value=TensorDict({"x": torch.ones(2), "y": torch.ones(2)}, [2])).save(1)
+    fewer = TensorDict({"x": torch.zeros(2)}, [2])
+    with pytest.raises(CheckpointError, match=r"expected the keys \['x'\], got \['x', 'y'\]"):
+        RunCheckpoint(tmp_path / "keys", value=fewer).load()
+    assert not fewer["x"].any()
 
 
 def test_publish_replaces_and_step_is_read_from_the_name(tmp_path: Path) -> None:

@@ -66,6 +66,10 @@ with distributed.processes():
     torch.nn.init.constant_(module.weight, float(rank + 1))
     distributed.share([module])
     assert module.weight.tolist() == [[1.0, 1.0]]
+    buffers = torch.nn.BatchNorm1d(2)
+    buffers.running_mean.fill_(rank + 1.0)
+    distributed.share([buffers])
+    assert buffers.running_mean.tolist() == [1.0, 1.0]
     (module.weight.sum() * (rank + 1)).backward()
     distributed.average_gradients(module.parameters())
     assert module.weight.grad.tolist() == [[1.5, 1.5]] and module.bias.grad is None
@@ -78,13 +82,13 @@ print("agreed")
 """
 
 
-def test_two_processes_update_as_one_with_all_the_experience(tmp_path: Path) -> None:
+def test_two_processes_update_as_one_with_all_the_experience(tmp_path: Path, repository: Path) -> None:
     script = tmp_path / "worker.py"
     script.write_text(textwrap.dedent(WORKER))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(repository)}
     command = [
         sys.executable,
         "-m",

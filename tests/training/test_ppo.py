@@ -113,6 +113,41 @@ def test_an_entry_may_be_called_like_what_comes_next() -> None:
     assert "kl_approx" in PPOUpdate(loss, optimizer, epochs=1, minibatches=1)(batch, generator)
 
 
+class Slopes(torch.nn.Module):
+    """Losses that are straight lines, so that a step of plain descent moves every weight by its slope."""
+
+    in_keys = ("observation",)
+
+    def __init__(self, *slopes: float) -> None:
+        super().__init__()
+        self.slopes, self.weight = slopes, torch.nn.Parameter(torch.zeros(3))
+
+    def forward(self, sample: TensorDict) -> TensorDict:
+        lines = (slope * weight for slope, weight in zip(self.slopes, self.weight, strict=True))
+        return TensorDict(dict(zip(("loss_objective", "loss_critic", "loss_entropy"), lines, strict=True)), [])
+
+
+@pytest.mark.parametrize(
+    ("slopes", "options", "moved"),
+    [
+        ((1.0, 2.0, 3.0), {"epochs": 2, "minibatches": 1}, (-2.0, -4.0, -6.0)),
+        # 3 minibatches of 42 samples, and the two that are left over are none.
+        ((1.0, 2.0, 3.0), {"epochs": 1, "minibatches": 3}, (-3.0, -6.0, -9.0)),
+        # A slope of 13, since 3^2 + 4^2 + 12^2 = 13^2, is made one of 2.
+        ((3.0, 4.0, 12.0), {"epochs": 1, "minibatches": 1, "max_grad_norm": 2.0}, (-6 / 13, -8 / 13, -24 / 13)),
+    ],
+)
+def test_every_step_descends_all_losses_once_and_not_too_far(
+    slopes: tuple[float, ...], options: dict[str, float], moved: tuple[float, ...]
+) -> None:
+    actor, critic, _ = build()
+    loss = Slopes(*slopes)
+    settings = {"max_grad_norm": 100.0, **options}
+    update = PPOUpdate(loss, torch.optim.SGD(loss.parameters(), lr=1.0), **settings)  # type: ignore[arg-type]
+    update(collect(actor, critic, torch.Generator().manual_seed(1)), torch.Generator().manual_seed(2))
+    assert loss.weight.tolist() == pytest.approx(moved)
+
+
 def test_an_extra_loss_is_added() -> None:
     actor, critic, update = build(epochs=1, minibatches=1)
     before = actor.network.std.detach().clone()
