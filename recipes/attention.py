@@ -191,7 +191,7 @@ def print_attention(result: Mapping[str, Any], disturbances: Mapping[str, str], 
     area = result["area_of_the_obstacle"].estimate
     console.print(f"{sum(result['images'].values())} images; the obstacle has {area:.3f} of an image", highlight=False)
     titles = {
-        "share": "share of attention on the obstacle's pixels, 95 % intervals",
+        "share": "share of attention on the obstacle's pixels, 95 % intervals over images",
         "share_over_area": "that share over the obstacle's share of the image (1: looks nowhere in particular)",
         "similarity_to_undisturbed": "cosine between attention on disturbed and on original images",
     }

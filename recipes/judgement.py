@@ -82,7 +82,8 @@ def draw_episode(
         "trunk height [m]": (3 if skill == JUMP else 4, recording.height[robot]),
     }
     wanted = {key: command[column].expand_as(values) for key, (column, values) in signals.items()}
-    plot = tracking_plot(wanted, {key: values for key, (_, values) in signals.items()}, CONTROL_DT)
+    measured, peaks = {key: values for key, (_, values) in signals.items()}, ["trunk height [m]"] * (skill == JUMP)
+    plot = tracking_plot(wanted, measured, CONTROL_DT, peaks=peaks)
     save_figure(plot, figures / f"tracking_{name}.png")
 
 

@@ -174,8 +174,9 @@ def main(config: Config, console: Console) -> Path:
     }
     plots["Trunk height [m]"] = ["/command.locomotion_height", "/command.jump_height", "/measured.height"]
     layout = write_layout(episode.parent, plots)
-    console.print(f"{episode}: {', '.join(config.behaviours)}; " + (f"fell in {fall}" if fall else "no fall"))
-    console.print(f"{layout}: import it in Foxglove beside the episode")
+    shown = f"{', '.join(config.behaviours)}; " + (f"fell in {fall}" if fall else "no fall")
+    console.print(f"{episode}: {shown}", markup=False)
+    console.print(f"{layout}: import it in Foxglove beside the episode", markup=False)
     if config.strip:
         picture = output / "figures" / f"{name}.png"
         reason = render(episode, picture, config.skin)

@@ -65,6 +65,8 @@ def main(config: Config) -> None:
     step = max(1, round(config.spacing / metadata["dt"]))
     pieces = rows_of(metadata, len(pose[0]))
     model = visible_model(config.skin)
+    buffer = model.vis.global_
+    buffer.offwidth, buffer.offheight = max(buffer.offwidth, config.width), max(buffer.offheight, config.height)
     data, camera = mujoco.MjData(model), mujoco.MjvCamera()
     camera.distance, camera.elevation = 1.1, -12.0
     figure = Figure(figsize=(1.6 * config.frames, 1.35 * len(pieces)), layout="constrained")

@@ -42,6 +42,7 @@ GROUPS = {
     "Skill prior": "prior/",
 }
 SMOOTHING = 0.9
+UNITS = {"speed": "m/s", "lateral speed": "m/s", "yaw rate": "rad/s", "height": "m"}
 
 
 @dataclass(frozen=True)
@@ -79,11 +80,18 @@ def results(found: Mapping[str, Any], figures: Path) -> str:
     rows = [[r["name"], interval(r["value"]), r["target"], verdicts[r["passed"]]] for r in found["targets"]]
     parts += ["<h2>Targets</h2>", table(["what", "measured", "target", ""], rows)]
     parts += ["<h2>Commanded and shown</h2>", picture(figures / "behaviour_matrix.png", "shares of episodes")]
-    parts.append(drawn(tracking_scatter(found["episodes"]), "one point an episode; on the dashed line it did as told"))
+    fall = found["matrix"]["columns"].index("fall")
+    parts.append(
+        drawn(
+            tracking_scatter(found["episodes"], fall),
+            "one point an episode, crosses fell; on the dashed line it did as told",
+        )
+    )
     names = found["episodes"]["quantities"]
     errors = {name: entry["errors"] for name, entry in found["behaviours"].items()}
     rows = [[name, *(interval(entry.get(key)) for key in names)] for name, entry in errors.items()]
-    parts += ["<h3>Mean errors of an episode</h3>", table(["commanded", *names], rows)]
+    heads = [f"{name}, {UNITS[name]}" for name in names]
+    parts += ["<h3>Mean errors of an episode, without falls</h3>", table(["commanded", *heads], rows)]
     parts.append("<h2>Robot and dog</h2>")
     for name, entry in found["behaviours"].items():
         rows = [
@@ -115,9 +123,9 @@ def results(found: Mapping[str, Any], figures: Path) -> str:
     return "\n".join(parts)
 
 
-def tracking_scatter(episodes: Mapping[str, Any]) -> Figure:
-    """Commanded against measured, one point an episode, one panel a quantity."""
-    skill = torch.tensor(episodes["skill"])
+def tracking_scatter(episodes: Mapping[str, Any], fall: int) -> Figure:
+    """Commanded against measured, one point an episode, one panel a quantity; ``fall`` was shown by who fell."""
+    skill, fell = torch.tensor(episodes["skill"]), torch.tensor(episodes["shown"]) == fall
     pairs = [torch.tensor([[or_nan(x) for x in row] for row in episodes[key]]) for key in ("commanded", "measured")]
     figure = Figure(figsize=(12.0, 3.4), layout="constrained")
     FigureCanvasAgg(figure)
@@ -125,10 +133,12 @@ def tracking_scatter(episodes: Mapping[str, Any]) -> Figure:
         axes = figure.add_subplot(1, len(episodes["quantities"]), column + 1)
         wanted, got = (pair[:, column] for pair in pairs)
         for index, behaviour in enumerate(BEHAVIOURS):
-            axes.scatter(wanted[skill == index], got[skill == index], s=7, alpha=0.6, label=behaviour)
+            for own, marker, label in ((~fell, "o", behaviour), (fell, "x", None)):
+                chosen = own & (skill == index)
+                axes.scatter(wanted[chosen], got[chosen], s=7, alpha=0.6, label=label, marker=marker, color=f"C{index}")
         ends = [float(wanted.min()), float(wanted.max())]
         axes.plot(ends, ends, "k--", linewidth=1.0)
-        axes.set_title(name, fontsize=10)
+        axes.set_title(f"{name}, {UNITS[name]}", fontsize=10)
         axes.set_xlabel("commanded", fontsize=9)
         axes.grid(alpha=0.3)
         if column == 0:
@@ -151,8 +161,10 @@ def curves(run: Path) -> str:
         return note("metrics.mcap holds no scalars yet")
     groups = {title: [name for name in scalars if name.startswith(start)] for title, start in GROUPS.items()}
     grouped = {name for names in groups.values() for name in names}
-    groups["Losses and the rest"] = [name for name in scalars if name not in grouped and not name.startswith("time/")]
-    groups["Time [s]"] = [name for name in scalars if name.startswith("time/")]
+    clock = [name for name in scalars if name.startswith("time/")]
+    other = ("time/minutes", "time/images_per_second")  # the only ones that are no seconds of an iteration
+    groups["Losses and the rest"] = [name for name in scalars if name not in (*grouped, *clock) or name in other]
+    groups["Time [s]"] = [name for name in clock if name not in other]
     return "\n".join(
         drawn(learning_curves({run.name: scalars}, sorted(names), smoothing=SMOOTHING, columns=4), title)
         for title, names in groups.items()
@@ -203,7 +215,7 @@ def page(run: Path) -> str:
         if value:
             text = escape(json.dumps(value, indent=2))
             parts.append(f"<details><summary>{title}</summary><pre>{text}</pre></details>")
-    return document(run.name, parts)
+    return document(run.resolve().name, parts)
 
 
 def main(config: Config) -> Path:

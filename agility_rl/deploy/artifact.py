@@ -137,11 +137,13 @@ class Artifact:
             )
         try:
             manifest = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
+            if isinstance(manifest, dict) and manifest.get("format_version") == 1:
+                manifest = {**_implied(), **manifest}
+            _check(manifest, str(path))
+        except ArtifactError:
+            raise
+        except (ValueError, TypeError, AttributeError) as error:
             raise ArtifactError(f"{path} is damaged: {error}; export the policy again") from error
-        if isinstance(manifest, dict) and manifest.get("format_version") == 1:
-            manifest = {**_implied(), **manifest}
-        _check(manifest, str(path))
         if kind is not None and manifest["kind"] != kind:
             raise ArtifactError(f"{path}: expected an artifact of kind {kind!r}, got {manifest['kind']!r}")
         entry = manifest.get("weights", {})
@@ -153,8 +155,7 @@ class Artifact:
                 f"{folder / name} is missing, though {MANIFEST_FILE} names it; copy the whole folder"
             )
         weights = (folder / name).read_bytes()
-        digest = hashlib.sha256(weights).hexdigest()
-        if digest != entry.get("sha256"):
+        if (digest := hashlib.sha256(weights).hexdigest()) != entry.get("sha256"):
             raise ArtifactError(
                 f"{folder / name} ({len(weights)} bytes) has SHA-256 {digest[:12]}, "
                 f"expected {str(entry.get('sha256'))[:12]}: truncated or altered; copy it again"
@@ -193,8 +194,8 @@ class Artifact:
         try:
             module.load_state_dict(self.state)
         except RuntimeError as error:
-            what = " ".join(str(error).split())[:400]  # of every entry; the first tell enough
-            raise ArtifactError(f"{self.folder}: the weights are not those of the expected network: {what}") from error
+            what = f"the weights are not those of the expected network: {' '.join(str(error).split())[:400]}"
+            raise ArtifactError(f"{self.folder}: {what}") from error
 
     def check_layout(self, name: str, layout: Iterable[Sequence[Any]]) -> None:
         """Compare one observation's layout with the layout that the running code would feed.
@@ -346,8 +347,7 @@ def _check(manifest: Any, where: str) -> None:
     _check_joints(manifest, where)
     if not 0.0 < manifest["control_period"] <= 1.0:
         raise ArtifactError(f"{where}: control_period must be in (0, 1] s, got {manifest['control_period']}")
-    here = _implied()["normalisers"]
-    for name, value in here.items():
+    for name, value in _implied()["normalisers"].items():
         if (found := manifest["normalisers"].get(name)) != value:
             raise ArtifactError(f"{where}: the controller was trained with {name} {found}, this code has {value}")
     if version != 1 and manifest.get(CHECKSUM) != (digest := manifest_checksum(manifest)):

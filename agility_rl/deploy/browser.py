@@ -80,7 +80,7 @@ class BrowserDevice:
 
     Raises:
         ValueError: if ``address`` is no IP address.
-        RuntimeError: if the viewer does not come up.
+        ConnectionError: if the viewer does not come up.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class BrowserDevice:
                 found = None
         if found is None:
             self.close()
-            raise RuntimeError(
+            raise ConnectionError(
                 f"the viewer's process ended with status {self._process.returncode} before it began; see its message"
             )
         host = f"[{address}]" if ":" in address else address

@@ -22,8 +22,8 @@ from agility_rl.record.messages import message_type, read_messages, read_raw
 from agility_rl.record.scene import WORLD, Shape, body_transforms, entity, foot_entity, robot_entities
 
 Contacts = message_type("Contacts", dict.fromkeys(constants.LEGS, "bool"))
-TRANSFORMS, JOINTS, CONTACTS, SCENE = "/tf", "/joint_states", "/contacts", "/scene"
-RESERVED = {topic[1:] for topic in (TRANSFORMS, JOINTS, CONTACTS, SCENE)}
+TRANSFORMS, JOINTS, CONTACTS, SCENE, FEET = "/tf", "/joint_states", "/contacts", "/scene", "/feet"
+RESERVED = {topic[1:] for topic in (TRANSFORMS, JOINTS, CONTACTS, SCENE, FEET)}
 
 
 class EpisodeRecorder:
@@ -145,14 +145,10 @@ class EpisodeRecorder:
 
     def _record_contact(self, contact: list[bool], time: int) -> None:
         self._write(CONTACTS, Contacts(**dict(zip(constants.LEGS, contact, strict=True))), time)
-        previous = self._contact or [not touching for touching in contact]
-        changed = [
-            foot_entity(leg, now)
-            for leg, now, before in zip(constants.LEGS, contact, previous, strict=True)
-            if now != before
-        ]
-        if changed:
-            self._write(SCENE, SceneUpdate(entities=changed), time)
+        if contact != self._contact:
+            # All feet each time, and apart from the scene: who jumps in time sees the last message of each topic alone.
+            feet = [foot_entity(leg, touching) for leg, touching in zip(constants.LEGS, contact, strict=True)]
+            self._write(FEET, SceneUpdate(entities=feet), time)
         self._contact = contact
 
     def _record_signals(self, group: str, values: Mapping[str, Any], time: int) -> None:
@@ -241,7 +237,7 @@ def read_episode(path: str | Path) -> dict[str, Tensor]:
                     rows.setdefault(f"joint_{name}", []).append([getattr(joint, field) for joint in value.joints])
         elif topic == CONTACTS:
             rows.setdefault("foot_contact", []).append([getattr(value, leg) for leg in constants.LEGS])
-        elif topic != SCENE:
+        elif topic not in (SCENE, FEET):
             for field in value.DESCRIPTOR.fields:
                 if not isinstance(number := getattr(value, field.name), str):
                     rows.setdefault(f"{topic[1:]}/{field.name}", []).append(number)

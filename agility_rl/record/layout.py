@@ -72,7 +72,7 @@ def _scene() -> dict[str, Any]:
         "followTf": TRUNK,
         "scene": {},
         "transforms": {},
-        "topics": {"/scene": {"visible": True}},
+        "topics": {"/scene": {"visible": True}, "/feet": {"visible": True}},
         "layers": {
             "grid": {
                 "layerId": "foxglove.Grid",

@@ -89,6 +89,7 @@ class MCAPLogger(Logger):
 
     def _copy_previous(self, stream: _Stream) -> None:
         """Copy what an earlier session wrote, and keep a damaged file beside."""
+        kinds = {kind.DESCRIPTOR.full_name: kind for kind in (Scalar, Histogram)}
         try:
             for record in read_raw(self.path):
                 if isinstance(record, Metadata):
@@ -101,10 +102,10 @@ class MCAPLogger(Logger):
                         self._schemas[schema.name] = identity
                     self._register(stream, channel.topic, schema.name, self._schemas[schema.name])
                 self._send(stream, channel.topic, message.data, message.log_time)
-                if schema.name == Scalar.DESCRIPTOR.full_name:
-                    scalar = Scalar.FromString(message.data)
-                    self.session = max(self.session, scalar.session + 1)
-                    self._next_step[channel.topic[1:]] = scalar.step + 1
+                if kind := kinds.get(schema.name):
+                    logged = kind.FromString(message.data)
+                    self.session = max(self.session, logged.session + 1)
+                    self._next_step[channel.topic[1:]] = logged.step + 1
         except DamageError:
             count = len(list(self.path.parent.glob("metrics.damaged-*.mcap")))
             os.link(self.path, self.path.with_name(f"metrics.damaged-{count + 1}.mcap"))

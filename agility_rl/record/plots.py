@@ -57,7 +57,8 @@ def learning_curves(
             if smoothing > 0.0:
                 axes.plot(steps, values, color=colour, alpha=0.25, linewidth=0.8)
                 values = _smooth(values, smoothing)
-            axes.plot(steps, values, color=colour, label=label, linewidth=1.4)
+            dot = "." if len(steps) == 1 else None  # a line of one point is invisible
+            axes.plot(steps, values, color=colour, label=label, linewidth=1.4, marker=dot)
         axes.set_title(name, fontsize=9)
         axes.set_xlabel("iteration", fontsize=8)
         axes.grid(alpha=0.3)
@@ -146,13 +147,16 @@ def behaviour_matrix(counts: Tensor, names: Sequence[str], columns: Sequence[str
     return figure
 
 
-def tracking_plot(commanded: Mapping[str, Tensor], measured: Mapping[str, Tensor], dt: float) -> Figure:
+def tracking_plot(
+    commanded: Mapping[str, Tensor], measured: Mapping[str, Tensor], dt: float, *, peaks: Sequence[str] = ()
+) -> Figure:
     """Commanded and measured signals over time, one panel a signal, with the root mean square error.
 
     Args:
         commanded: signal name (with its unit) to ``[T]``.
         measured: the same names to ``[T]``.
         dt: time between two values [s].
+        peaks: signals whose peaks are commanded, such as a jump's height; their error is not that of every instant.
 
     Raises:
         KeyError: if a commanded signal was not measured.
@@ -171,7 +175,7 @@ def tracking_plot(commanded: Mapping[str, Tensor], measured: Mapping[str, Tensor
         axes.plot(time, wanted.cpu(), "k--", linewidth=1.0, label="commanded")
         axes.plot(time, measured[name].cpu(), linewidth=1.2, label="measured")
         error = (measured[name] - wanted).double().square().mean().sqrt().item()
-        axes.set_title(f"{name}, RMS error {error:.3f}", fontsize=9)
+        axes.set_title(f"{name}, " + ("peaks commanded" if name in peaks else f"RMS error {error:.3f}"), fontsize=9)
         axes.grid(alpha=0.3)
         if index == 0:
             axes.legend(fontsize=8)
@@ -204,6 +208,7 @@ def new_figure(width: float, height: float) -> Figure:
 def _smooth(values: np.ndarray, smoothing: float) -> np.ndarray:
     smooth, average = np.empty_like(values, dtype=float), float("nan")
     for index, value in enumerate(values):
-        average = value if np.isnan(average) else smoothing * average + (1.0 - smoothing) * value
-        smooth[index] = average
+        if not np.isnan(value):
+            average = value if np.isnan(average) else smoothing * average + (1.0 - smoothing) * value
+        smooth[index] = average if not np.isnan(value) else value
     return smooth

@@ -122,8 +122,8 @@ class SimulationParameters:
             self._put("body_ipos", rows, centre + value.double(), trunk)
         elif name == "action_delay":
             steps = (value[:, 0] / self.world.sim_dt).round().long()
-            if bool((steps > self.world.substeps).any()):
-                raise ValueError(f"action_delay must be at most one control step, {self.world.control_dt} s")
+            if bool(((steps < 0) | (steps > self.world.substeps)).any()):
+                raise ValueError(f"action_delay must be from 0 to one control step, {self.world.control_dt} s")
             self.delay = steps if bool(steps.any()) else None
         else:
             self._put(_OF_JOINTS[name], rows, value, JOINT_SPEEDS)

@@ -280,10 +280,15 @@ def versions() -> dict[str, str]:
             found[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             continue
-    source = Path(agility_rl.__file__).parent
+    source = Path(agility_rl.__file__)
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(source.parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+
     try:
-        head = ["git", "-C", str(source), "describe", "--always", "--dirty", "--abbrev=12"]
-        found["commit"] = subprocess.run(head, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+        git("ls-files", "--error-unmatch", source.name)  # else the checkout is one that it was installed into
+        found["commit"] = git("describe", "--always", "--dirty", "--abbrev=12")
     except (OSError, subprocess.SubprocessError):
         pass
     return found

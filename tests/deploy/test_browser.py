@@ -141,7 +141,7 @@ def test_a_viewer_that_dies_is_noticed_and_closing_is_safe() -> None:
 
 
 def test_a_taken_port_is_an_error_that_says_so(device: BrowserDevice, capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(RuntimeError, match="ended with status"):
+    with pytest.raises(ConnectionError, match="ended with status"):
         BrowserDevice(dress(build_spec()).compile(), port=port_of(device))
     assert f"Port {port_of(device)} is already in use" in capfd.readouterr().err
 

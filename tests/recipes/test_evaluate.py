@@ -50,9 +50,14 @@ def test_an_evaluation_writes_numbers_tables_and_pictures(untrained: Path, recip
     assert {"behaviour_matrix.png", *(f"footfall_{name}.png" for name in BEHAVIOURS)} <= pictures
 
     report = module("report")
+    scatter = report.tracking_scatter(found["episodes"], found["matrix"]["columns"].index("fall"))
+    points = [len(marks.get_offsets()) for marks in scatter.axes[0].collections]
+    assert sum(points[1::2]) == sum(entry["shown"]["fall"] for entry in found["behaviours"].values())
+    assert sum(points) == len(rows["skill"])
     page = report.main(report.Config(untrained))
     text = page.read_text()
     assert page == untrained / "report.html"
+    assert "Mean errors of an episode, without falls" in text and "yaw rate, rad/s" in text
     assert "no metrics.mcap" in text and text.count("data:image/png;base64,") >= 12
     assert "http://" not in text and "https://" not in text, "the page needs no network"
 

@@ -21,7 +21,7 @@ def test_a_run_without_evaluation_shows_its_learning_curves(tmp_path: Path, modu
     run = start_run(Config(), tmp_path / "young", recipe="bbc_pretrain")
     logger = MCAPLogger(run.name, run.parent)
     for step in range(3):
-        logger.log_metrics({"reward/task": float(step), "kl": 0.01}, step=step)
+        logger.log_metrics({"reward/task": float(step), "kl": 0.01, "time/minutes": 1.0}, step=step)
     logger.close()
     report = module("report")
     report.main(report.Config(run))

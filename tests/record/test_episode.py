@@ -52,6 +52,7 @@ def test_schemas_are_those_foxglove_and_rerun_know(tmp_path: Path, episode: dict
         "/tf": "foxglove.FrameTransforms",
         "/joint_states": "foxglove.JointStates",
         "/scene": "foxglove.SceneUpdate",
+        "/feet": "foxglove.SceneUpdate",
         "/contacts": "agility_rl.Contacts",
         "/command": "agility_rl.Command",
         "/reward": "agility_rl.Reward",
@@ -63,10 +64,14 @@ def test_schemas_are_those_foxglove_and_rerun_know(tmp_path: Path, episode: dict
     joints = next(record.value for record in records if record.topic == "/joint_states").joints
     assert tuple(joint.name for joint in joints) == constants.JOINT_NAMES
     scene = [record.value for record in records if record.topic == "/scene"]
-    assert {e.id for e in scene[0].entities} >= {"trunk", "FL_calf", "bar"}
-    colours = {e.id: e.spheres[0].color.r for update in scene[:2] for e in update.entities if e.id.endswith("_foot")}
-    touching = dict(zip(constants.LEGS, episode["foot_contact"][0].tolist(), strict=True))
-    assert {leg: colours[f"{leg}_foot"] > 0.5 for leg in constants.LEGS} == touching
+    assert len(scene) == 1 and {e.id for e in scene[0].entities} >= {"trunk", "FL_calf", "bar"}
+    feet = {record.time: record.value.entities for record in records if record.topic == "/feet"}
+    for time, entities in feet.items():  # each message has all four, for viewers that jump to it
+        coloured = {entity.id: entity.spheres[0].color.r > 0.5 for entity in entities}
+        touching = episode["foot_contact"][round(time / 20_000_000)].tolist()
+        assert coloured == {f"{leg}_foot": there for leg, there in zip(constants.LEGS, touching, strict=True)}
+    changes = (episode["foot_contact"][1:] != episode["foot_contact"][:-1]).any(-1).sum()
+    assert len(feet) == 1 + changes
 
 
 def test_the_optional_parts_are_optional(tmp_path: Path, episode: dict[str, torch.Tensor]) -> None:

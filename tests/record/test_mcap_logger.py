@@ -136,6 +136,16 @@ def test_a_resumed_run_may_log_what_has_steps_of_its_own(tmp_path: Path) -> None
     assert values(tmp_path / "run", "final_evaluation") == ([0], [0.8])
 
 
+def test_histograms_go_on_too(tmp_path: Path) -> None:
+    for _ in range(3):
+        logger = MCAPLogger("run", tmp_path, resume=(tmp_path / "run").exists())
+        logger.log_histogram("weights", torch.arange(4.0))
+        logger.log_histogram("weights", torch.arange(4.0))
+        logger.close()
+    logged = [(record.value.step, record.value.session) for record in read_messages(logger.path)]
+    assert logged == [(0, 0), (1, 0), (2, 1), (3, 1), (4, 2), (5, 2)]
+
+
 def test_resume_after_a_cut_keeps_what_is_readable(tmp_path: Path) -> None:
     logger = MCAPLogger("run", tmp_path, flush_interval=0)
     for step in range(4):

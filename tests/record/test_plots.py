@@ -21,6 +21,11 @@ def test_learning_curves() -> None:
     loss, reward = figure.axes
     assert loss.get_title() == "loss" and len(loss.lines) == 4 and len(reward.lines) == 2
     assert list(loss.lines[1].get_ydata()) == [4.0, 3.0, 2.5, 2.25]
+    only = learning_curves({"a": {"loss": (steps[:1], torch.ones(1))}}, ["loss"])
+    assert only.axes[0].lines[0].get_marker() == "."
+    gap = torch.tensor([0.0, 2.0, float("nan"), 2.0])
+    line = learning_curves({"a": {"loss": (steps, gap)}}, ["loss"], smoothing=0.5).axes[0].lines[1]
+    assert line.get_ydata()[[0, 1, 3]].tolist() == [0.0, 1.0, 1.5]
     with pytest.raises(ValueError, match="no run has any of nothing_like_it; they have loss, reward"):
         learning_curves(runs, ["nothing_like_it"])
 
@@ -45,6 +50,7 @@ def test_tracking_plot() -> None:
     time = torch.arange(10.0)
     figure = tracking_plot({"v": time, "w": time}, {"v": time, "w": time + 2.0, "x": time}, dt=0.02)
     assert [axes.get_title() for axes in figure.axes] == ["v, RMS error 0.000", "w, RMS error 2.000"]
+    assert tracking_plot({"v": time}, {"v": time}, 0.02, peaks=["v"]).axes[0].get_title() == "v, peaks commanded"
     with pytest.raises(KeyError, match="not measured"):
         tracking_plot({"v": time}, {}, dt=0.02)
 

@@ -134,8 +134,9 @@ def test_wrong_parameters_are_refused() -> None:
         simulator.set_parameters(everyone(2), stifness=torch.zeros(2, 12))
     with pytest.raises(ValueError, match=r"\[2, 12\]"):
         simulator.set_parameters(everyone(2), stiffness=torch.zeros(2, 1))
-    with pytest.raises(ValueError, match="action_delay"):
-        simulator.set_parameters(everyone(2), action_delay=torch.full((2, 1), 0.5))
+    for seconds in (0.5, -0.01):
+        with pytest.raises(ValueError, match=r"action_delay must be from 0 to one control step, 0.02 s"):
+            simulator.set_parameters(everyone(2), action_delay=torch.full((2, 1), seconds))
 
 
 def test_parameters_are_read_as_copies() -> None:

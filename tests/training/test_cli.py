@@ -5,12 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import signal
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
+import agility_rl
 from agility_rl.training import cli
 from agility_rl.training.cli import abandon_run, from_json, from_presets, read_config, start_run, to_json, versions
 
@@ -103,6 +107,26 @@ def test_help_shows_documentation_and_presets(arguments: list[str], capsys: pyte
 def test_presets_must_agree() -> None:
     with pytest.raises(ValueError, match=r"\['PPO', 'Run'\]"):
         from_presets({"a": PPO(), "b": Run()}, ["a"])
+
+
+def test_the_commit_is_that_of_the_package_and_of_no_checkout_around_it(tmp_path: Path) -> None:
+    package = tmp_path / "site-packages" / "agility_rl"
+    shutil.copytree(Path(agility_rl.__file__).parent, package)
+    script = "from agility_rl.training.cli import versions; print('commit' in versions())"
+
+    def told() -> str:
+        environment = os.environ | {"PYTHONPATH": str(package.parent)}
+        command = [sys.executable, "-c", script]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=True)
+        return done.stdout.strip()
+
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c"]
+    for arguments in (("init", "-q"), ("commit", "-q", "--allow-empty", "-m", "mine")):
+        subprocess.run([*git, *arguments], check=True)
+    assert told() == "False"
+    for arguments in (("add", "."), ("commit", "-q", "-m", "a fork")):
+        subprocess.run([*git, *arguments], check=True)
+    assert told() == "True"
 
 
 def test_a_run_folder_is_never_overwritten(tmp_path: Path) -> None:
