@@ -82,7 +82,13 @@ class Trials:
 
 
 def hold_trials(config: Config) -> Trials:
-    """Let robots trot, put a box before each, and tell them to jump."""
+    """Let robots trot, put a box before each, and tell them to jump.
+
+    Raises:
+        ValueError: if there is nothing to try.
+    """
+    if config.repeats < 1 or not (config.heights and config.distances and config.speeds):
+        raise ValueError("expected --repeats of at least 1, and --heights, --distances and --speeds")
     controller = load_controller(config.run)
     grid = list(itertools.product(config.heights, config.distances, config.speeds)) * config.repeats
     case, n = torch.tensor(grid), len(grid)

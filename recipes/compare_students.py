@@ -165,8 +165,8 @@ def compare(config: Config, console: Console) -> dict[str, Any]:
     students = [load_decider(path, config.bbc, kind="student") for path in config.runs]
     teacher = None if config.teacher is None else load_decider(config.teacher, config.bbc, kind="teacher")
     names = [str(path) for path in config.runs]
-    if len(set(names)) < len(names):
-        raise ValueError("every student counts once: a run folder is given twice")
+    if len({student.weights for student in students}) < len(names):
+        raise ValueError("every student counts once: two folders hold the same weights")
     if teacher is not None:
         for name, student in zip(names, students, strict=True):
             if student.manifest["teacher"] != teacher.weights:

@@ -162,7 +162,7 @@ def load_script(text: str, bbc: Path | None, fastest_canter: float = FASTEST_CAN
             f"--script: {text!r} leaves decisions to a teacher, and there is none; say what it does usually"
         )
     controller = load_controller(bbc or TeacherConfig().bbc)
-    label = "script_" + text.replace(":", "_").replace(",", "_").replace("=", "_")
+    label = "script_" + text.replace(":", "_").replace(",", "_").replace("=", "_").replace("/", "_")
     return Decider(
         script.decide,
         1,

@@ -139,11 +139,7 @@ def simulate(
 
 
 def names(config: Config, decider: Decider) -> list[str]:
-    """Courses to run, each once, groups taken apart.
-
-    Raises:
-        ValueError: if there is no such course.
-    """
+    """Courses to run, each once, groups taken apart."""
     wanted: dict[str, None] = {}
     for name in config.course or (decider.course,):
         wanted |= dict.fromkeys(GROUPS.get(name, (name,)))
@@ -196,12 +192,17 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError(f"--misjudgement: {decider.name} knows nothing to do about an unseen obstacle; give a teacher")
     cells = [(name, key) for name in names(config, decider) for key in disturbances]
     courses = {name: course_of(name) for name, _ in cells}
+    stems = [Path(name).stem for name in courses]
+    files = {  # two files of one name have pictures of their own
+        name: stem if stems.index(stem) == index else f"{stem}-{index + 1}"
+        for index, (name, stem) in enumerate(zip(courses, stems, strict=True))
+    }
     output = config.output or decider.run or Path("runs") / decider.name
     found: dict[str, Any] = {}
     use: dict[str, Tensor] = {}
     with Progress(console=console, transient=True) as bar:
         for name, key in cells:
-            course, label, file = courses[name], name, Path(name).stem
+            course, label, file = courses[name], name, files[name]
             if key != "none":
                 label, file = f"{name}, {disturbances[key].label}", f"{file}_{key}"
             task = bar.add_task(label, total=config.episodes)

@@ -7,6 +7,7 @@ all of them train one policy, and the first one writes.
 from __future__ import annotations
 
 import contextlib
+import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -93,6 +94,26 @@ def policy_to_start_from(path: Path, kind: str, hidden: tuple[int, ...]) -> Arti
             f"{start.folder}: its hidden layers are {own}, this run builds {list(hidden)}; give --ppo.hidden {sizes}"
         )
     return start
+
+
+def check_began_with(run: Path | None, kind: str, digest: str, path: Path) -> None:
+    """Refuse to resume a run on another frozen policy than it began with.
+
+    Args:
+        run: that is resumed, or ``None``.
+        kind: under which its manifest names the policy's weights.
+        digest: of the weights that lie at ``path`` now.
+
+    Raises:
+        ArtifactError: if they are others.
+    """
+    if run is not None and (run / "policy" / MANIFEST_FILE).is_file():
+        began = json.loads((run / "policy" / MANIFEST_FILE).read_text(encoding="utf-8"))[kind]
+        if began != digest:
+            raise ArtifactError(
+                f"{run} began with another policy ({kind} {began[:12]}) than {path} holds now ({digest[:12]}); put it "
+                "back, or begin another run with --init-from"
+            )
 
 
 class Laps:

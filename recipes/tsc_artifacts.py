@@ -151,3 +151,15 @@ def trained_bbc(trained: Trained) -> Path:
         except (json.JSONDecodeError, KeyError, TypeError):
             continue  # somebody else's manifest
     return TeacherConfig().bbc
+
+
+def refuse_starts_after(start_after: float, trained: Trained) -> None:
+    """Students that count their way believe that they begin before the next obstacle, not behind the one before.
+
+    Raises:
+        ValueError: if robots shall start where such a student does not expect it.
+    """
+    if start_after and trained.network.settings["num_place"]:
+        raise ValueError(
+            f"--env.start-after {start_after:g}: a student that knows its place expects to start before an obstacle"
+        )

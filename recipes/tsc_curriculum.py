@@ -49,7 +49,8 @@ class Curriculum:
             return
         if self.successes / self.episodes >= self.cfg.success:
             if self.difficulty < 1.0:
-                self.difficulty = min(1.0, self.difficulty + self.cfg.difficulty_step)
+                # Rounded, since ten steps of 0.1 are less than 1.
+                self.difficulty = min(1.0, round(self.difficulty + self.cfg.difficulty_step, 6))
             else:
                 self.obstacles = min(self.most, self.obstacles + 1)
         self.successes = self.episodes = 0

@@ -75,7 +75,8 @@ def check(cfg: Config) -> None:
 
 def collect(cfg: Config) -> TensorDictBase:
     """Walk and look: :func:`glances.asked`, ``[T, N]``."""
-    student = load_trained(cfg.student, "student").network.settings
+    learner = load_trained(cfg.student, "student")
+    student = learner.network.settings
     sizes = ("memory", "encoder_channels", "encoder_hidden", "encoder_features", "glance_hidden", "heading_gate")
     robots = ("course", "num_robots", "num_threads", "start_spread", "start_after", "episode_length")
     run, trained = resolve(
@@ -89,6 +90,8 @@ def collect(cfg: Config) -> TensorDictBase:
             **{name: student[name] for name in sizes if name in student},
         )
     )
+    if learner.artifact.manifest["teacher"] != trained.digest:
+        print(f"{cfg.student} learned from another teacher than {cfg.teacher}, whose view of the terrain is stored")
     parts = build(run, trained)
     load_student(parts, cfg.student, frozen_parts(run))
     parts.collector.led = round(cfg.led * cfg.num_robots)

@@ -29,8 +29,8 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch.optim.swa_utils import AveragedModel
 from torchrl.data import Unbounded
 from torchrl.envs import Compose, InitTracker, TensorDictPrimer, TransformedEnv
-from training_run import Laps, own_options, run
-from tsc_artifacts import load_bbc_of, load_trained, trained_bbc
+from training_run import Laps, check_began_with, own_options, run
+from tsc_artifacts import load_bbc_of, load_trained, refuse_starts_after, trained_bbc
 from tsc_config import CPU as TEACHER
 from tsc_config import CurriculumConfig, PPOConfig, RewardConfig
 from tsc_curriculum import Curriculum
@@ -145,9 +145,11 @@ def build(cfg: Config) -> Components:
     device = training_device(cfg)
     seeds = seed_everything(cfg.seed, device)
     trained = load_trained(cfg.student, "student")
+    check_began_with(cfg.resume, "practised_from", trained.digest, cfg.student)
     student = trained.network.to(device).requires_grad_(False)
     assert isinstance(student, RecurrentStudent)
     student.actor.requires_grad_(True)
+    student.actor.network.parameters_head.min_std.fill_(cfg.ppo.min_std)
     student.depth_encoder.to(memory_format=torch.channels_last)
     student.depth_encoder.module.precision = hidden_precision(cfg.precision, device)
     controller = load_bbc_of(trained, cfg.bbc)
@@ -241,7 +243,13 @@ def train(cfg: Config) -> Path:
         raise ValueError(
             f"--reward.imitation: practice pays for the task alone; expected 0, not {cfg.reward.imitation}"
         )
-    cfg = replace(cfg, bbc=cfg.bbc or trained_bbc(load_trained(cfg.student, "student")))
+    if not cfg.ppo.min_std <= cfg.ppo.initial_std:
+        raise ValueError(
+            f"expected --ppo.min-std of at most --ppo.initial-std, got {cfg.ppo.min_std} and {cfg.ppo.initial_std}"
+        )
+    trained = load_trained(cfg.student, "student")
+    refuse_starts_after(cfg.env.start_after, trained)
+    cfg = replace(cfg, bbc=cfg.bbc or trained_bbc(trained))
     return run(
         "tsc_practice",
         cfg,

@@ -16,6 +16,7 @@ from rollouts import Controller, load_controller
 from tensordict import TensorDictBase
 from torch.optim.swa_utils import AveragedModel
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from training_run import check_began_with
 from tsc_config import Config, RewardConfig, RobotsConfig
 from tsc_curriculum import Curriculum
 from tsc_ppo import Learner, make_learner
@@ -73,6 +74,7 @@ def build(cfg: Config) -> Components:
     device, ppo = training_device(cfg), cfg.ppo
     seeds = seed_everything(cfg.seed, device)
     controller = load_controller(cfg.bbc)
+    check_began_with(cfg.resume, "bbc", controller.artifact.manifest["weights"]["sha256"], cfg.bbc)
     discriminator, offsets = load_discriminator(controller.run, cfg.reward.imitation > 0.0)
     imitation = None
     if discriminator is not None:

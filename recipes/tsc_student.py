@@ -27,6 +27,7 @@ from learning_rates import annealed, set_learning_rate
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from training_run import Laps, finite, own_options, run
+from tsc_artifacts import refuse_starts_after
 from tsc_student_config import PRESETS, Config
 from tsc_student_setup import (
     Components,
@@ -165,6 +166,7 @@ def train(cfg: Config) -> Path:
     cfg = own_options(cfg)
     check(cfg)
     cfg, trained = resolve(cfg)
+    refuse_starts_after(cfg.env.start_after, trained)
     return run(
         "tsc_student",
         cfg,

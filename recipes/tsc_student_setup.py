@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,6 +14,7 @@ from rollouts import Controller
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.objectives import SoftUpdate
+from training_run import check_began_with
 from tsc_artifacts import Trained, load_bbc_of, load_trained, trained_bbc
 from tsc_curriculum import Curriculum
 from tsc_setup import make_env
@@ -97,13 +97,7 @@ def resolve(cfg: Config) -> tuple[Config, Trained]:
         ArtifactError: if it is no teacher, or not the one that a resumed run began with.
     """
     trained = load_trained(cfg.teacher, "teacher")
-    if cfg.resume is not None and (manifest := cfg.resume / "policy" / "manifest.json").is_file():
-        began = json.loads(manifest.read_text(encoding="utf-8"))["teacher"]
-        if began != trained.digest:
-            raise ArtifactError(
-                f"{cfg.resume} learns from the teacher {began[:12]}, but {cfg.teacher} holds {trained.digest[:12]}; "
-                "put that one back, or begin another run with --init-from"
-            )
+    check_began_with(cfg.resume, "teacher", trained.digest, cfg.teacher)
     course = cfg.env.course or trained.course
     return replace(cfg, bbc=cfg.bbc or trained_bbc(trained), env=replace(cfg.env, course=course)), trained
 

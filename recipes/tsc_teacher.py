@@ -118,6 +118,8 @@ def train(cfg: Config) -> Path:
             f"--cloning.script {cfg.cloning.script} keeps what a teacher does; give it by --init-from, or a script "
             "that says what it does usually"
         )
+    if script.complete and cfg.cloning.iterations > 0 and cfg.init_from is not None and cfg.resume is None:
+        print(f"--cloning.script {cfg.cloning.script} is not copied: {cfg.init_from} is started from")
     if copies(cfg) and (forbidden := sorted(set(script.behaviours) - set(cfg.behaviours))):
         raise ValueError(
             f"--cloning.script {cfg.cloning.script} chooses {', '.join(forbidden)}, which --behaviours leaves out; "

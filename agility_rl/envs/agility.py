@@ -58,9 +58,9 @@ class AgilityEnv(MaskedResets):
     Keys read: ``(action, behaviour)`` int64 [N], ``(action, parameters)`` [N, 5, 6].
 
     Keys written, beside those of :class:`LocomotionEnv` (where ``command``, ``skill`` and ``shift`` are now the last
-    decision's): ``heading_error`` [N, 2], ``obstacle`` [N, 7], ``scandots`` [N, 132], ``(outcome, name)`` bool
-    [N, 1] or [N, 7], ``(terminations, name)`` bool [N, 1], and with a camera ``depth`` [N, 58, 87]. Units stand in
-    :mod:`agility_rl.keys`.
+    decision's): ``heading_error`` [N, 2], ``obstacle`` [N, 7], ``scandots`` [N, 132], ``place`` [N, 8], ``progress``
+    [N, S], ``(outcome, name)`` bool [N, 1] or [N, 7], ``(terminations, name)`` bool [N, 1], and with a camera ``depth``
+    [N, 58, 87]. Units stand in :mod:`agility_rl.keys`.
 
     Args:
         num_robots: N.

@@ -28,6 +28,7 @@ import json
 import math
 import tomllib
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def load_course(path: str | Path) -> Course:
         if path.suffix == ".toml":
             data: Any = tomllib.loads(text)
         elif path.suffix == ".json":
-            data = json.loads(text, object_pairs_hook=_unique)
+            data = json.loads(text, object_pairs_hook=partial(_unique, path))
         else:
             raise CourseError(f"{path}: expected a .toml or .json file")
     except OSError as error:
@@ -87,12 +88,12 @@ def parse_course(data: Mapping[str, Any], where: str = "course") -> Course:
         raise CourseError(f"{where}: {error}") from error
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique(path: Path, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Refuse a key that is there twice, which JSON would let pass (TOML does not)."""
     names = [name for name, _ in pairs]
     for name in names:
         if names.count(name) > 1:
-            raise CourseError(f"malformed: key {name!r} is there twice in one table")
+            raise CourseError(f"{path}: malformed: key {name!r} is there twice in one table")
     return dict(pairs)
 
 

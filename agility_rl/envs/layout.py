@@ -12,8 +12,8 @@ from agility_rl.envs.obstacles import SEESAW_TILT
 from agility_rl.simulation import Piece, Shape
 
 _WALL = 0.05
-_OUTWARDS = ((0.0, -1.0), (0.0, 1.0), (-1.0, 0.0), (1.0, 0.0))
 """Half thickness of a wall [m] (ours)."""
+_OUTWARDS = ((0.0, -1.0), (0.0, 1.0), (-1.0, 0.0), (1.0, 0.0))
 _BUFFERS = ("position", "yaw", "lift", "route", "length", "first_leg", "wall_height", "wall_distance")
 
 

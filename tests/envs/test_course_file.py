@@ -87,7 +87,7 @@ def test_a_bad_file_gives_one_message(tmp_path: Path, old: str, new: str, messag
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("c.json", '{"size": [4, 8], "size": [4, 8]}', "key 'size' is there twice"),
+        ("c.json", '{"size": [4, 8], "size": [4, 8]}', "c.json: malformed: key 'size' is there twice"),
         ("c.json", "[1, 2]", "expected a table"),
         ("c.json", '{"size": [4, 8], "slots": {}}', "slots must be a list"),
         ("c.json", '{"size": [4, 8], "slots": [3]}', "slot 0: expected a table"),

@@ -72,8 +72,8 @@ def test_students_are_compared_on_the_same_courses(
     assert found["teacher"]["successes"] == 0 and found["targets"] == []
     assert "Gaussian blur" in console.file.getvalue()
     assert (tmp_path / "out" / "figures" / "success_under_disturbance.png").is_file()
-    with pytest.raises(ValueError, match="a run folder is given twice"):
-        recipe.compare(replace(config, runs=(runs[0], runs[0])), console)
+    with pytest.raises(ValueError, match="two folders hold the same weights"):
+        recipe.compare(replace(config, runs=(runs[0], runs[0] / "policy")), console)
     with pytest.raises(ValueError, match=r"expected a student of tsc_student\.py, got an artifact of kind 'teacher'"):
         recipe.compare(replace(config, runs=(untrained_teacher,)), console)
     stranger = make_student("stranger", teacher="0" * 64)

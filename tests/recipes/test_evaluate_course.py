@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from io import StringIO
@@ -104,14 +105,17 @@ def test_a_script_needs_no_teacher_and_a_course_may_be_a_file(
     file = tmp_path / "mine.toml"
     file.write_text('name = "my course"\nsize = [4.0, 7.0]\n[[slots]]\nobstacle = "seesaw"\nposition = [2.0, 3.5]\n'
                     "yaw_degrees = 90.0\n")  # fmt: skip
-    scripted = replace(config, run=None, script="canter:1.4", output=tmp_path / "out", course=(str(file), "box"))
+    (tmp_path / "other").mkdir()
+    other = shutil.copy(file, tmp_path / "other" / "mine.toml")
+    courses = (str(file), "box", str(other))
+    scripted = replace(config, run=None, script="canter:1.4", output=tmp_path / "out", course=courses)
     found = recipe.evaluate(scripted, screen())
-    assert list(found["courses"]) == [str(file), "box"] and found["weights"] is None
+    assert tuple(found["courses"]) == courses and found["weights"] is None
     assert found["behaviours"] == ("canter",)
     assert found["courses"]["box"]["obstacles"]["box_jump"]["behaviours"]["canter"] == 1.0
     assert [row["name"] for row in found["targets"]] == ["box: success"]
     pictures = {path.name for path in (tmp_path / "out" / "figures").iterdir()}
-    assert pictures == {"course_mine.png", "course_box.png", "course_behaviours.png"}
+    assert pictures == {"course_mine.png", "course_mine-3.png", "course_box.png", "course_behaviours.png"}
 
 
 def test_a_script_may_canter_faster(recipe: ModuleType, config: Any, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from agility_rl import keys
-from agility_rl.deploy.artifact import Artifact
+from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.modules.student import NEXT_HIDDEN, PERCEIVED_PLACE
 from agility_rl.record.mcap_logger import read_scalars
 
@@ -65,6 +65,24 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smok
     assert not [name for name in one if not torch.equal(one[name], other[name])]
     for name in ("reward/task", "loss_critic", "use/jump"):
         assert torch.equal(read_scalars(whole)[name][1], read_scalars(halves)[name][1]), name
+    before = Artifact.load(smoke.student)
+    moved = {name: value + 0.1 for name, value in before.state.items()}
+    Artifact.save(before.folder, moved, {k: v for k, v in before.manifest.items() if k != "weights"})
+    with pytest.raises(ArtifactError, match=r"began with another policy \(practised_from .{12}\) than .* holds now"):
+        recipe.train(replace(smoke, resume=halves, iterations=5))
+
+
+def test_its_deviations_are_those_of_its_options(recipe: ModuleType, smoke: Any) -> None:
+    cfg = replace(smoke, ppo=replace(smoke.ppo, min_std=0.03, initial_std=0.05))
+    parts = recipe.build(cfg)
+    recipe.begin(parts, cfg)
+    head = parts.student.actor.network.parameters_head
+    assert head.min_std.tolist() == pytest.approx([0.03] * 30) and head.std.tolist() == pytest.approx([0.05] * 30)
+    parts.env.close()
+    with pytest.raises(ValueError, match=r"--ppo.min-std of at most --ppo.initial-std, got 0.2 and 0.15"):
+        recipe.train(replace(smoke, ppo=replace(smoke.ppo, min_std=0.2)))
+    with pytest.raises(ValueError, match=r"--env.start-after 0.5: a student that knows its place"):
+        recipe.train(replace(smoke, env=replace(smoke.env, start_after=0.5)))
 
 
 def test_it_perceives_as_when_it_walks_by_itself(recipe: ModuleType, smoke: Any) -> None:

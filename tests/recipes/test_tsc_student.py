@@ -309,6 +309,7 @@ def test_the_paper_preset_is_the_papers(module: Module) -> None:
         (("--env.course", "hurdles"), "course hurdles: its bar_jump has way-points of its own"),
         (("--representation.images", "2", "--representation.minibatches", "2"), "BYOL needs 2 images or more, got 1"),
         (("--glance.batch", "0"), "expected every, epochs, batch and kept above 0"),
+        (("--env.start-after", "1"), "--env.start-after 1: a student that knows its place expects"),
         (("--env.num-robots", "1"), "--glance.images: expected two robots or more"),
         (("--byo",), "did you mean --byol?"),
     ],
@@ -350,7 +351,7 @@ def test_another_camera_another_teacher_and_other_sizes_are_refused(
     weights = {name: value + 1.0 for name, value in other.state.items()}
     manifest = {name: value for name, value in other.manifest.items() if name != "weights"}
     Artifact.save(smoke.teacher / "policy", weights, manifest)
-    with pytest.raises(ValueError, match=r"learns from the teacher .{12}, but .* holds .{12}; put that one back"):
+    with pytest.raises(ValueError, match=r"began with another policy \(teacher .{12}\) than .* holds now"):
         recipe.train(replace(smoke, resume=run))
 
 

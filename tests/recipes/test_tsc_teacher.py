@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -118,9 +119,22 @@ def test_a_teacher_learns_to_read_its_place_from_where_it_was(recipe: ModuleType
         recipe.train(wider)
 
 
-def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any) -> None:
+def test_it_is_not_resumed_on_another_controller(recipe: ModuleType, smoke: Any, tmp_path: Path) -> None:
+    own = tmp_path / "controller"
+    shutil.copytree(smoke.bbc / "policy", own / "policy")
+    run = recipe.train(replace(smoke, bbc=own, iterations=1))
+    before = Artifact.load(own)
+    moved = {name: value + 0.1 for name, value in before.state.items()}
+    Artifact.save(own / "policy", moved, {k: v for k, v in before.manifest.items() if k != "weights"})
+    with pytest.raises(ArtifactError, match=r"began with another policy \(bbc .{12}\) than .* holds now"):
+        recipe.train(replace(smoke, resume=run, iterations=2))
+
+
+def test_init_from_and_one_behaviour(recipe: ModuleType, smoke: Any, capsys: pytest.CaptureFixture[str]) -> None:
     parent = recipe.train(replace(smoke, iterations=1))
-    child = recipe.train(replace(smoke, name="child", iterations=1, init_from=parent))
+    copied = replace(smoke.cloning, script="trot:1.2", iterations=1)
+    child = recipe.train(replace(smoke, name="child", iterations=1, init_from=parent, cloning=copied))
+    assert f"--cloning.script trot:1.2 is not copied: {parent} is started from" in capsys.readouterr().out
     assert Artifact.load(child / "policy").manifest["course"] == "full"
     broad = replace(smoke.ppo, initial_std=0.5, min_std=0.4)
     wide = recipe.train(replace(smoke, name="wide", iterations=0, init_from=parent, ppo=broad))
@@ -191,6 +205,10 @@ def test_the_curriculum_by_hand(module: Module) -> None:
         curriculum.update(nothing, nothing, successes, 10)
         steps.append((curriculum.difficulty, curriculum.obstacles))
     assert steps == [(0.5, 1), (0.5, 1), (1.0, 1), (1.0, 2), (1.0, 3), (1.0, 3)]
+    tenths = grown.Curriculum(replace(cfg, difficulty_step=0.1), 0.0, 1, most=3)
+    for _ in range(10):
+        tenths.update(nothing, nothing, 10, 10)
+    assert (tenths.difficulty, tenths.obstacles) == (1.0, 1)
     curriculum.passed, curriculum.failed = torch.ones(len(OBSTACLES)), torch.zeros(len(OBSTACLES))
     curriculum.failed[2] = 3.0  # a success rate of a quarter
     weights = curriculum.start_weights(torch.nn.functional.one_hot(torch.tensor([0, 2]), len(OBSTACLES)))
