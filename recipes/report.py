@@ -133,9 +133,10 @@ def tracking_scatter(episodes: Mapping[str, Any], fall: int) -> Figure:
         axes = figure.add_subplot(1, len(episodes["quantities"]), column + 1)
         wanted, got = (pair[:, column] for pair in pairs)
         for index, behaviour in enumerate(BEHAVIOURS):
-            for own, marker, label in ((~fell, "o", behaviour), (fell, "x", None)):
+            for own, marker, size, label in ((~fell, "o", 7, behaviour), (fell, "x", 28, None)):
                 chosen = own & (skill == index)
-                axes.scatter(wanted[chosen], got[chosen], s=7, alpha=0.6, label=label, marker=marker, color=f"C{index}")
+                points, colour = (wanted[chosen], got[chosen]), f"C{index}"
+                axes.scatter(*points, s=size, alpha=0.6, label=label, marker=marker, color=colour)
         ends = [float(wanted.min()), float(wanted.max())]
         axes.plot(ends, ends, "k--", linewidth=1.0)
         axes.set_title(f"{name}, {UNITS[name]}", fontsize=10)
