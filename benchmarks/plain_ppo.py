@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import os
-import statistics
 import sys
 import time
 from dataclasses import replace
@@ -22,6 +21,7 @@ from types import ModuleType
 from typing import Any
 
 import torch
+import turns
 from plain_locomotion import PlainLocomotion
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -370,33 +370,11 @@ def main() -> None:
     if options.only != "recipe":
         own = recipe.build(cfg)
         runs["plain"] = Plain(cfg, own.env, own.dataset, options.bfloat16).iterate
-    seconds: dict[str, list[dict[str, float]]] = {name: [] for name in runs}
-    for iteration in range(options.warmup + options.iterations):
-        for name, run in runs.items():
-            start = time.perf_counter()
-            phases = run(options.start + iteration)
-            total = time.perf_counter() - start
-            if iteration >= options.warmup:
-                seconds[name].append({p: phases.get(p, phases.get(f"time/{p}", float("nan"))) for p in PHASES})
-                seconds[name][-1]["iteration"] = total
-    frames = cfg.env.num_robots * cfg.ppo.steps
+    numbers = range(options.start, options.start + options.warmup + options.iterations)
+    found = turns.phases_in_turns(runs, PHASES, numbers, options.warmup)
     threads, load = torch.get_num_threads(), os.getloadavg()[0]
     print(f"{cfg.env.num_robots} robots x {cfg.ppo.steps} steps, {threads} torch threads, load {load:.1f}")
-    print(f"{'median seconds':16}" + "".join(f"{phase:>12}" for phase in (*PHASES, "iteration")) + f"{'steps/s':>12}")
-    median = {
-        name: {phase: statistics.median(entry[phase] for entry in entries) for phase in (*PHASES, "iteration")}
-        for name, entries in seconds.items()
-    }
-    for name, entry in median.items():
-        print(
-            f"{name:16}"
-            + "".join(f"{value:12.3f}" for value in entry.values())
-            + f"{frames / entry['iteration']:12.0f}"
-        )
-    if len(median) == 2:
-        pairs = zip(seconds["plain"], seconds["recipe"], strict=True)
-        ratio = statistics.median(plain["iteration"] / other["iteration"] for plain, other in pairs)
-        print(f"speed of the recipe relative to the plain loop: {ratio:.3f}")
+    turns.print_phases(found, cfg.env.num_robots * cfg.ppo.steps)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import statistics
 import sys
 import time
 from dataclasses import replace
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import turns
 from plain_ppo import History, mlp
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -230,25 +230,11 @@ def main() -> None:
         "recipe": lambda number: recipe.iterate(parts, cfg, START + number),
         "plain": lambda number: plain.iterate(),
     }
-    phases = ("collect", "policy", "adaptation", "iteration")
-    seconds: dict[str, list[dict[str, float]]] = {name: [] for name in runs}
-    for number in range(args.warmup + args.iterations):
-        for name, run in runs.items():
-            start = time.perf_counter()
-            spent = run(number)
-            total = time.perf_counter() - start
-            if number >= args.warmup:
-                row = {phase: spent.get(phase, spent.get(f"time/{phase}", float("nan"))) for phase in phases}
-                seconds[name].append(row | {"iteration": total})
+    numbers = range(args.warmup + args.iterations)
+    found = turns.phases_in_turns(runs, ("collect", "policy", "adaptation"), numbers, args.warmup)
     threads, load = torch.get_num_threads(), os.getloadavg()[0]
     print(f"{cfg.env.num_robots} robots x {cfg.ppo.steps} decisions, {threads} torch threads, load {load:.1f}")
-    print(f"{'median seconds':16}" + "".join(f"{phase:>12}" for phase in phases))
-    for name, rows in seconds.items():
-        print(f"{name:16}" + "".join(f"{statistics.median(row[phase] for row in rows):12.3f}" for phase in phases))
-    ratio = statistics.median(
-        plain["iteration"] / own["iteration"] for plain, own in zip(seconds["plain"], seconds["recipe"], strict=True)
-    )
-    print(f"speed of the recipe relative to the plain loop: {ratio:.3f}")
+    turns.print_phases(found, cfg.env.num_robots * cfg.ppo.steps)
 
 
 if __name__ == "__main__":

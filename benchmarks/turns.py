@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import statistics
 import time
@@ -64,6 +65,38 @@ def print_rates(found: Mapping[str, list[float]], done: int, unit: str) -> None:
     for name, times in found.items():
         rate = done / statistics.median(times)
         print(f"{name:38} {rate:10.0f} {unit}/s {speed_up(reference, times):8.1%} of bare")
+
+
+Phases = dict[str, list[dict[str, float]]]
+"""Seconds of each phase of a loop's iterations, and of a whole ``iteration``."""
+
+
+def phases_in_turns(
+    loops: Mapping[str, Callable[[int], Mapping[str, float]]], phases: Sequence[str], numbers: range, warm_up: int
+) -> Phases:
+    """Run loops that tell the seconds of their phases, an iteration at a time; the first ``warm_up`` do not count."""
+    found: Phases = {name: [] for name in loops}
+    for index, number in enumerate(numbers):
+        for name, loop in loops.items():
+            start = time.perf_counter()
+            spent = loop(number)
+            total = time.perf_counter() - start
+            if index >= warm_up:
+                row = {phase: spent.get(phase, spent.get(f"time/{phase}", math.nan)) for phase in phases}
+                found[name].append(row | {"iteration": total})
+    return found
+
+
+def print_phases(found: Phases, done: int) -> None:
+    """Medians, ``done`` of something an iteration, and how many times as fast as the plain loop the recipe is."""
+    heads = list(next(iter(found.values()))[0])
+    print(f"{'median seconds':16}" + "".join(f"{head:>12}" for head in heads) + f"{'steps/s':>12}")
+    for name, rows in found.items():
+        middle = [statistics.median(row[head] for row in rows) for head in heads]
+        print(f"{name:16}" + "".join(f"{value:12.3f}" for value in middle) + f"{done / middle[-1]:12.0f}")
+    if {"recipe", "plain"} <= found.keys():
+        plain, recipe = ([row["iteration"] for row in found[name]] for name in ("plain", "recipe"))
+        print(f"speed of the recipe relative to the plain loop: {speed_up(plain, recipe):.3f}")
 
 
 def circumstances(robots: int, threads: int) -> str:
