@@ -313,7 +313,11 @@ def main(options: dict[str, Any], lines: TextIO, out: TextIO) -> None:
     )
 
     def target(endpoint: Any) -> None:
-        viewer = AddressedWebViewer(config, endpoint, address=address, pulse=pulse, plugins=[panel])
+        try:
+            viewer = AddressedWebViewer(config, endpoint, address=address, pulse=pulse, plugins=[panel])
+        except (RuntimeError, OSError) as error:  # such as a port that is taken
+            sys.stderr.write(f"{error}\n")
+            os._exit(2)  # this is a thread, and there is nothing to end in order yet
         wait_for_server(address, viewer._http_port)
         send({"port": viewer._http_port})
         viewer_protocol.run_viewer_loop(viewer)
