@@ -39,6 +39,7 @@ from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 from tsc_setup import course_of, frozen
+from unique_names import unique_names
 
 from agility_rl.behaviours import FASTEST_CANTER
 from agility_rl.envs import AgilityEnv, Course
@@ -192,11 +193,7 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         raise ValueError(f"--misjudgement: {decider.name} knows nothing to do about an unseen obstacle; give a teacher")
     cells = [(name, key) for name in names(config, decider) for key in disturbances]
     courses = {name: course_of(name) for name, _ in cells}
-    stems = [Path(name).stem for name in courses]
-    files = {  # two files of one name have pictures of their own
-        name: stem if stems.index(stem) == index else f"{stem}-{index + 1}"
-        for index, (name, stem) in enumerate(zip(courses, stems, strict=True))
-    }
+    files = dict(zip(courses, unique_names(list(courses)), strict=True))
     output = config.output or decider.run or Path("runs") / decider.name
     found: dict[str, Any] = {}
     use: dict[str, Tensor] = {}

@@ -11,7 +11,6 @@ is 1. Gaits are named from foot phases, speed and trunk height, window by window
 
 from __future__ import annotations
 
-import itertools
 import re
 import sys
 from collections import Counter
@@ -23,6 +22,7 @@ import torch
 import tyro
 from rich.console import Console
 from rich.table import Table
+from unique_names import unique_names
 
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.motion import MotionClip, MotionError, load_clip
@@ -165,17 +165,6 @@ def write(rows: list[Inspection], names: list[str], folder: Path) -> None:
             raise MotionError(f"{target}: exists and is not overwritten; choose another --convert folder or remove it")
     for row, target in zip(rows, targets, strict=True):
         save(row.clip, target)
-
-
-def unique_names(paths: list[str]) -> list[str]:
-    """File stems, made longer by their folders where two are alike, and by a number where these are alike too."""
-    stems = [Path(path).stem for path in paths]
-    alike, names = Counter(stems), list[str]()
-    for path, stem in zip(paths, stems, strict=True):
-        name = stem if alike[stem] == 1 else "-".join(Path(path).with_suffix("").parts)
-        further = (f"{name}-{number}" for number in itertools.count(2))
-        names.append(next(free for free in itertools.chain([name], further) if free not in names))
-    return names
 
 
 def main(config: Config, console: Console) -> int:

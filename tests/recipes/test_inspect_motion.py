@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -14,14 +13,9 @@ from agility_rl.motion.clip import MotionError, load, save
 from agility_rl.motion.gaits import synthesize_gait
 
 
-@pytest.fixture(scope="module")
-def recipe(repository: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("inspect_motion", repository / "recipes" / "inspect_motion.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture
+def recipe(module: Callable[[str], ModuleType]) -> ModuleType:
+    return module("inspect_motion")
 
 
 @pytest.fixture
@@ -66,11 +60,6 @@ def test_without_a_path_the_synthetic_gaits_are_shown(recipe: ModuleType, screen
     assert "5 of 5 clips named after a behaviour" in text
     assert "no dog moved like this" in text
     assert not (tmp_path / "none").exists()
-
-
-def test_alike_names_are_told_apart(recipe: ModuleType) -> None:
-    assert recipe.unique_names(["a/x.json", "b/x.json", "y.bvh"]) == ["a-x", "b-x", "y"]
-    assert recipe.unique_names(["x.json", "x.npz", "x.json"]) == ["x", "x-2", "x-3"]
 
 
 def test_files_of_one_name_from_two_folders_are_all_written(
