@@ -81,12 +81,11 @@ def results(found: Mapping[str, Any], figures: Path) -> str:
     parts += ["<h2>Targets</h2>", table(["what", "measured", "target", ""], rows)]
     parts += ["<h2>Commanded and shown</h2>", picture(figures / "behaviour_matrix.png", "shares of episodes")]
     fall = found["matrix"]["columns"].index("fall")
-    parts.append(
-        drawn(
-            tracking_scatter(found["episodes"], fall),
-            "one point an episode, crosses fell; on the dashed line it did as told",
-        )
+    scatter, caption = (
+        tracking_scatter(found["episodes"], fall),
+        "one point an episode; on the dashed line it did as told",
     )
+    parts.append(drawn(scatter, f"{caption}, crosses fell"))
     names = found["episodes"]["quantities"]
     errors = {name: entry["errors"] for name, entry in found["behaviours"].items()}
     rows = [[name, *(interval(entry.get(key)) for key in names)] for name, entry in errors.items()]

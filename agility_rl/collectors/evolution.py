@@ -139,7 +139,11 @@ class EvolutionStrategy:
         return correlation.fill_diagonal_(1.0)
 
     def anew(self, generator: torch.Generator) -> EvolutionStrategy:
-        """The same search before its first generation, with random numbers of its own."""
+        """The same search before its first generation, with random numbers of its own; this one is left alone.
+
+        Args:
+            generator: source of its randomness.
+        """
         other = copy(self)
         other.generator = generator
         other._begin()

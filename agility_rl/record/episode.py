@@ -30,9 +30,10 @@ class EpisodeRecorder:
     """Write one robot's episode to an MCAP file with Foxglove schemas.
 
     Topics: ``/tf`` (FrameTransforms of 13 bodies), ``/joint_states`` (JointStates: position, velocity, torque),
-    ``/contacts`` (a boolean a foot), ``/scene`` (SceneUpdate: robot and obstacles as primitives, feet coloured by
-    contact), and ``/NAME`` for every group of signals, such as ``/command`` and ``/reward``. The file takes its name
-    when it is complete; until then an earlier one of that name stays.
+    ``/contacts`` (a boolean a foot), ``/scene`` (SceneUpdate: robot and obstacles as primitives, once), ``/feet``
+    (SceneUpdate: all four, coloured by contact, at every change), and ``/NAME`` for every group of signals, such as
+    ``/command`` and ``/reward``. The file takes its name when it is complete; until then an earlier one of that name
+    stays.
 
     Source: Foxglove message schemas (protobuf); no formula.
 
