@@ -48,7 +48,7 @@ class EnvConfig(RobotsConfig):
     """What the forward speed of a commanded canter ends at [m/s]: Table S2's 2.0, or faster (ours), which the
     controller has not practised. Its students and whoever runs it command the same."""
     misjudgement: float = 0.0
-    """Factor on errors of the place, the directions and the obstacle that it is told, of the sizes of a student's; 0:
+    """Factor on errors of the place, the directions, the obstacle and the terrain that it is told, as a student's; 0:
     all is true (ours)."""
 
 

@@ -82,7 +82,7 @@ class AgilityEnv(MaskedResets):
         start: before a random obstacle, or before the first.
         start_spread: how many times as far aside and turned as released (:class:`~agility_rl.envs.arena.Arena`).
         start_after: share of random starts that are where the obstacle before is left.
-        misjudgement: factor on how wrong ``place``, ``heading_error`` and ``obstacle`` are
+        misjudgement: factor on how wrong ``place``, ``heading_error``, ``obstacle`` and ``scandots`` are
             (:class:`~agility_rl.envs.misjudgement.Misjudgement`; ours); 0: they are true.
         push_interval: seconds between pushes; ``None`` for none.
         push_velocity: largest horizontal speed on each axis that a push sets [m/s].

@@ -43,7 +43,7 @@ class Arena:
         start_after: share of random starts that are where the obstacle before is left, so that robots come to the
             next as on the whole course (turned away from it in an S, say), and not straight from a stand before it.
         start_spread: how many times as far aside and turned as released; 4 covers how robots leave the obstacle before.
-        misjudgement: how wrong what robots are told of their place and of directions is; ``None``: not at all.
+        misjudgement: how wrong what robots are told of their place, directions and terrain is; ``None``: not at all.
 
     Attributes:
         layout: where the obstacles stand.
@@ -219,14 +219,16 @@ class Arena:
     def observe(self, simulator: Simulator, yaw: Tensor) -> TensorDict:
         """What the Task-Specific Controller sees of the course, ``[N]``."""
         parameter = self.layout.parameter(simulator.hinge_angle)
-        told = self.expected_goals(), *self.believed(simulator.root_position[:, :2], yaw)
+        position, yaw = self.believed(simulator.root_position[:, :2], yaw)
+        told = self.expected_goals(), position, yaw
+        trunk = torch.cat((position, simulator.root_position[:, 2:]), -1)
         return TensorDict(
             {
                 keys.HEADING_ERROR: self._bearings(*told),
                 keys.PLACE: self.place(*told),
                 keys.OBSTACLE: self.expected_type(),
                 keys.PROGRESS: torch.nn.functional.one_hot(self.progress.stage, self.progress.num_stages).float(),
-                keys.SCANDOTS: self.scan.scandots(simulator.root_position, yaw, parameter),
+                keys.SCANDOTS: self.scan.scandots(trunk, yaw, parameter),
             },
             [len(yaw)],
         )

@@ -211,6 +211,13 @@ def test_robots_that_misjudge_their_place_are_told_one_story() -> None:
     at_obstacle = arena.layout.local_to(arena.progress.obstacle, goals[:, 0])
     away = torch.linalg.vector_norm(at_obstacle - place[:, 4:6], dim=-1)
     torch.testing.assert_close(torch.linalg.vector_norm(place[:, :2], dim=-1), away, atol=1e-5, rtol=0)
+    # The terrain is that of where they think they are.
+    obstacle, parameter = arena.progress.obstacle, arena.layout.parameter(simulator.hinge_angle)
+    told = torch.cat((arena.layout.world(obstacle, place[:, 4:6]), simulator.root_position[:, 2:]), -1)
+    turned = torch.atan2(place[:, 6], place[:, 7]) + arena.layout.axis(obstacle)
+    same = (seen[keys.SCANDOTS] - arena.scan.scandots(told, turned, parameter)).abs() < 1e-4
+    assert same.float().mean() > 0.99  # but for cells at edges
+    assert not torch.equal(seen[keys.SCANDOTS], arena.scan.scandots(simulator.root_position, yaw, parameter))
     state = arena.state_dict()
     arena.advance(arena.progress.leg, position, yaw)
     assert not torch.equal(arena.observe(simulator, yaw)[keys.PLACE], place)
