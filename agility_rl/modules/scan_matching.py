@@ -37,11 +37,6 @@ angle within 5 degrees: method notes, section 5.8)."""
 LEAST, SHARE, FAR = 15, 0.3, 0.8
 """A match counts if it explains so many of the raised points, such a share of them, and lies less than so far [m] from
 where it was expected."""
-ASIDE = 0.35
-"""So far beside the expected place fits begin too, on either side [m]: from there alone who is that wrong holds a post
-of a tire for the other (docs/student.md)."""
-BETTER = (1.1, 3.0)
-"""What such a fit explains must be more than this multiple of what the first does, and so many points more."""
 FLOOR = (0.015, 0.015, 0.008)
 """Least deviation of a match: x, y [m], yaw [rad]."""
 HELD = (1.0, 0.1, 0.1)
@@ -60,9 +55,8 @@ class ScanMatcher(nn.Module):
     :math:`p_i` are points that the image measures, d their distance from the surface of obstacle and ground
     (:class:`~agility_rl.modules.distance_field.DistanceField`), and :math:`\xi` is the robot's pose at the obstacle
     with its height, roll and pitch and the image's common error. Four steps of Gauss and Newton with weights of Geman
-    and McClure, whose width c falls, begin where the obstacle is expected and on either side of it; the fit that
-    explains most counts. A network that reads a place from an image errs alike in image after image, and holds what is
-    usual for seen; a shape that fits does neither. It has to be expected within some 0.5 m.
+    and McClure, whose width c falls. A network that reads a place from an image errs alike in image after image, and
+    holds what is usual for seen; a shape that fits does neither. It has to be expected within some 0.3 m.
 
     Source: ours; scan matching against a distance field: Fitzgibbon 2003 (doi:10.1016/j.imavis.2003.09.004).
 
@@ -87,7 +81,6 @@ class ScanMatcher(nn.Module):
     expected: Tensor
     floor: Tensor
     held: Tensor
-    across: Tensor
 
     def __init__(self, types: Sequence[Sequence[Solid]]) -> None:
         super().__init__()
@@ -101,7 +94,6 @@ class ScanMatcher(nn.Module):
             "expected": torch.tensor(EXPECTED),
             "floor": torch.tensor(FLOOR),
             "held": torch.tensor(HELD),
-            "across": torch.eye(len(EXPECTED))[1],
         }.items():
             self.register_buffer(name, value, persistent=False)
 
@@ -128,31 +120,7 @@ class ScanMatcher(nn.Module):
         height, yaw = estimate[:, 0], torch.atan2(robot[:, 2], robot[:, 3])
         start = torch.stack((robot[:, 0], robot[:, 1], yaw, height, pitch, roll, torch.zeros_like(roll)), -1)
         points, rays, valid = self._points(depth, height, roll, pitch)
-        begun = torch.cat([start + aside * self.across for aside in (0.0, ASIDE, -ASIDE)])
-        again = (part.repeat(3, *(1,) * (part.dim() - 1)) for part in (start, kind, points, rays, valid))
-        fits = [part.unflatten(0, (3, -1)) for part in self._fit(begun, *again)]
-        explained = fits[2]
-        gain = torch.cat((explained[:1], (explained[1:] - BETTER[1]) / BETTER[0]))
-        best = gain.argmax(0, keepdim=True)
-        found, covariance, explained, there = (
-            part.take_along_dim(best.view(1, -1, *(1,) * (part.dim() - 2)), 0)[0] for part in fits
-        )
-        pose = torch.cat((found[:, :2], found[:, 2:3].sin(), found[:, 2:3].cos()), -1)
-        seen = inverted(moved(pose, motion))
-        near = torch.linalg.vector_norm((found - start)[:, :2], dim=-1) < FAR
-        counts = (explained > LEAST) & (explained > SHARE * there) & near
-        variance = self.held * _seen_variance(covariance[:, :3, :3], pose, seen) + self.floor.square()
-        return torch.cat((seen, torch.where(counts[:, None], variance, NOTHING)), -1)
-
-    def _fit(
-        self, found: Tensor, expected: Tensor, kind: Tensor, points: Tensor, rays: Tensor, valid: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gauss-Newton from poses ``[N, 7]`` where those of ``[N, 7]`` are expected.
-
-        Returns:
-            Poses, their covariance ``[N, 7, 7]``, how many raised points each explains, and of how many, ``[N]``.
-        """
-        unsure = self.expected.square()
+        found, unsure = start, self.expected.square()
         known = torch.diag(unsure.reciprocal())
         for step in range(STEPS):
             width = WIDTH[0] * (WIDTH[1] / WIDTH[0]) ** (step / (STEPS - 1))
@@ -163,10 +131,17 @@ class ScanMatcher(nn.Module):
             normal = (slope * weight[..., None]).mT @ slope / DEVIATION**2 + known
             residual = (slope * (weight * distance)[..., None]).sum(-2) / DEVIATION**2
             covariance = inverted_spd(normal)
-            pull = residual + (found - expected) / unsure
+            pull = residual + (found - start) / unsure
             found = found - (covariance @ pull[..., None])[..., 0]
         raised = here[..., 2] > ABOVE
-        return found, covariance, (weight * raised).sum(-1), (valid & covered & raised).sum(-1)
+        explained = (weight * raised).sum(-1)
+        there = (valid & covered & raised).sum(-1)
+        pose = torch.cat((found[:, :2], found[:, 2:3].sin(), found[:, 2:3].cos()), -1)
+        seen = inverted(moved(pose, motion))
+        near = torch.linalg.vector_norm((found - start)[:, :2], dim=-1) < FAR
+        counts = (explained > LEAST) & (explained > SHARE * there) & near
+        variance = self.held * _seen_variance(covariance[:, :3, :3], pose, seen) + self.floor.square()
+        return torch.cat((seen, torch.where(counts[:, None], variance, NOTHING)), -1)
 
     def _points(self, depth: Tensor, height: Tensor, roll: Tensor, pitch: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Points in the trunk's frame and their rays, ``[N, P, 3]``, and which of them were measured."""

@@ -74,20 +74,6 @@ def test_an_obstacle_is_found_where_it_stands(matcher: ScanMatcher, name: str, n
     assert (deviation >= torch.tensor(FLOOR)).all() and (deviation.median(0).values < 0.2).all()
 
 
-@pytest.mark.parametrize("name", ["tire_jump", "a_frame", "tunnel"])
-@pytest.mark.parametrize("aside", [0.35, -0.35])
-def test_an_obstacle_is_found_from_far_beside_it(matcher: ScanMatcher, name: str, aside: float) -> None:
-    """Expected a tire's half width beside where it stands, where one of its posts looks like the other."""
-    measured, seen, kind = standing(name)
-    sine, cosine = seen[:, 2], seen[:, 3]  # the obstacle's own left, seen by the robot, is (-sine, cosine)
-    expected = torch.cat((seen[:, :2] + aside * torch.stack((-sine, cosine), -1), seen[:, 2:]), -1)
-    match = matcher(*measured, expected, kind)
-    off = match[:, :2] - seen[:, :2]
-    across = (cosine * off[:, 1] - sine * off[:, 0]).abs()[match[:, 4] < NOTHING]
-    assert len(across) > 0.6 * ROBOTS
-    assert (across < 0.12).float().mean() > 0.9, across
-
-
 def test_who_sees_nothing_is_told_nothing(matcher: ScanMatcher) -> None:
     (_, proprioception, estimate), seen, kind = standing("tunnel")
     estimate[:, 1] = 3.0 * features.LINEAR_VELOCITY_SCALE  # where it was expected, however fast the robot is
