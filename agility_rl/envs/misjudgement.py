@@ -16,7 +16,7 @@ LASTING = 0.6
 """Time in which such an error falls to 1/e [s]: images in a row err alike, and what has been counted wrong stays so."""
 UNSEEN = (0.13, 0.21, 0.05)
 """Deviations of one that has not: how far it stands from where the course has it, along, across [m], and turned [rad];
-about what docs/student.md measured, across a little less (0.14 there)."""
+behind U-turns (docs/student.md)."""
 VIEW_DISTANCE, VIEW_ANGLE = 3.0, 0.7
 """Nearer than this [m], and by less than this [rad] beside where the robot looks, an obstacle is in view."""
 RECOGNITION = 0.25
@@ -29,15 +29,15 @@ class Misjudgement:
 
     .. math:: \hat p &= R(c\, u_\psi)\,(p + c\, u_{xy}), \quad \hat\psi = \psi + c\, u_\psi, \qquad
               \hat o' = \hat o + e_{xy}, \quad \hat\psi' = \hat\psi + e_\psi \\
-              c_{t + 1} &= \begin{cases} e^{-\Delta t / 0.15\,\mathrm{s}}\, c_t & \text{in view} \\
+              c_{t + 1} &= \begin{cases} e^{-\Delta t / 0.25\,\mathrm{s}}\, c_t & \text{in view} \\
               c_t & \text{else} \end{cases}, \qquad
               e_{t + 1} = a\, e_t + \sqrt{1 - a^2}\, \sigma \odot \xi, \quad a = e^{-\Delta t / 0.6\,\mathrm{s}}
 
     p and :math:`\psi` are the robot's place and yaw in its obstacle's frame, o is where it sees the obstacle. Until it
     has been in view, the obstacle stands for the robot where the course has it, u away from where it does, and is of
     no type, which also tells the robot that it has not seen it; afterwards it is seen e beside where it is. All sizes
-    are multiplied by the factor. All else that is said of the place follows from there. The obstacle after it is
-    unseen, too.
+    are multiplied by the factor. All else that is said of the place follows from there, and the terrain is what lies
+    around there. The obstacle after it is unseen, too.
 
     Source: ours; the sizes are those of a student that matches shapes (docs/student.md). A teacher that learns with
     them chooses what is good for whoever knows his place no better, and no earlier.
