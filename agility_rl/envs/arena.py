@@ -156,12 +156,13 @@ class Arena:
         return self.layout.local_to(obstacle, position), yaw - self.layout.axis(obstacle)
 
     def believed(self, position: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor]:
-        """Where robots at ``[N, 2]`` [m] with headings ``[N]`` [rad] are told that they are."""
+        """Where trunks at ``[N, 3]`` [m] with headings ``[N]`` [rad] are told that they are."""
         if self.misjudgement is None:
             return position, yaw
         obstacle = self.progress.obstacle
-        local, turned = self.misjudgement.misjudged(*self._at(obstacle, position, yaw))
-        return self.layout.world(obstacle, local), self.layout.axis(obstacle) + turned
+        local, turned = self.misjudgement.misjudged(*self._at(obstacle, position[:, :2], yaw))
+        believed = torch.cat((self.layout.world(obstacle, local), position[:, 2:]), -1)
+        return believed, self.layout.axis(obstacle) + turned
 
     def _stand(self, leg: Tensor) -> tuple[Tensor, Tensor]:
         """Obstacle by which the robots of legs ``[N]`` start, and where in its frame, int64 ``[N]`` and ``[N, 2]``."""
@@ -219,9 +220,8 @@ class Arena:
     def observe(self, simulator: Simulator, yaw: Tensor) -> TensorDict:
         """What the Task-Specific Controller sees of the course, ``[N]``."""
         parameter = self.layout.parameter(simulator.hinge_angle)
-        position, yaw = self.believed(simulator.root_position[:, :2], yaw)
-        told = self.expected_goals(), position, yaw
-        trunk = torch.cat((position, simulator.root_position[:, 2:]), -1)
+        trunk, yaw = self.believed(simulator.root_position, yaw)
+        told = self.expected_goals(), trunk[:, :2], yaw
         return TensorDict(
             {
                 keys.HEADING_ERROR: self._bearings(*told),
