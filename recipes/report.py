@@ -81,11 +81,8 @@ def results(found: Mapping[str, Any], figures: Path) -> str:
     parts += ["<h2>Targets</h2>", table(["what", "measured", "target", ""], rows)]
     parts += ["<h2>Commanded and shown</h2>", picture(figures / "behaviour_matrix.png", "shares of episodes")]
     fall = found["matrix"]["columns"].index("fall")
-    scatter, caption = (
-        tracking_scatter(found["episodes"], fall),
-        "one point an episode; on the dashed line it did as told",
-    )
-    parts.append(drawn(scatter, f"{caption}, crosses fell"))
+    caption = "one point an episode; on the dashed line it did as told, crosses fell"
+    parts.append(drawn(tracking_scatter(found["episodes"], fall), caption))
     names = found["episodes"]["quantities"]
     errors = {name: entry["errors"] for name, entry in found["behaviours"].items()}
     rows = [[name, *(interval(entry.get(key)) for key in names)] for name, entry in errors.items()]
