@@ -58,7 +58,7 @@ def test_an_unseen_obstacle_is_thought_to_stand_where_it_does_not() -> None:
 @pytest.mark.parametrize(
     ("x", "y", "yaw", "in_view"),
     [
-        (-2.4, 0.0, 0.0, True),
+        (-VIEW_DISTANCE + 0.01, 0.0, 0.0, True),
         (-VIEW_DISTANCE - 0.01, 0.0, 0.0, False),
         (-2.0, 0.0, VIEW_ANGLE - 0.01, True),
         (-2.0, 0.0, -VIEW_ANGLE - 0.01, False),
