@@ -105,7 +105,8 @@ DEPTH_FEATURE = "depth_feature"
 """float32 ``[*B, 32]``, what the depth encoder makes of one image."""
 
 HIDDEN = "hidden"
-"""float32 ``[*B, 512]``, the student's memory before a step; with its place behind it ``[*B, 520]``."""
+"""float32 ``[*B, 512]``, the student's memory before a step; more of it where that knows a place
+(:class:`agility_rl.modules.RecurrentStudent`)."""
 
 HEADING_ESTIMATE = "heading_estimate"
 """float32 ``[*B, 2]``, the student's guess of :data:`HEADING_ERROR` [rad]."""
@@ -114,8 +115,9 @@ PLACE_ESTIMATE = "place_estimate"
 """float32 ``[*B, 8]``, the student's guess of :data:`PLACE`, where its teacher reads that."""
 
 SCAN_MATCH = "scan_match"
-"""float32 ``[*B, 7]``, where the obstacle ahead is seen by its shape: x, y [m], sine and cosine of its yaw in the
-robot's frame, then the variances of x, y [m^2] and yaw [rad^2]."""
+"""float32 ``[*B, 21]``, where the obstacle ahead is seen by its shape: x, y [m], sine and cosine of its yaw in the
+robot's frame, then the variances of x, y [m^2] and yaw [rad^2]; the same of the obstacle after it, and what speaks for
+each of its 7 types [nat]."""
 
 PROGRESS_LOGITS = "progress_logits"
 """float32 ``[*B, S]``, the student's log-probabilities of :data:`PROGRESS`, where its teacher reads the place."""

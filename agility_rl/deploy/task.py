@@ -189,7 +189,8 @@ def memory_size(artifact: Artifact) -> int:
     units = int(network["memory"])
     if not network.get("num_place"):
         return units
-    return sum(memory_parts(units, sum(map(len, network["routes"])), len(network["way_points"][0])))
+    points = network["way_points"]
+    return sum(memory_parts(units, sum(map(len, network["routes"])), len(points[0]), len(points)))
 
 
 def fastest_canter(artifact: Artifact) -> float:

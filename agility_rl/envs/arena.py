@@ -196,7 +196,7 @@ class Arena:
         """Way-points in the world as robots that misjudge their place expect them, ``[N, 2 goals, 2]``."""
         if self.misjudgement is None:
             return torch.stack(self.progress.goals(), 1)
-        current, following = self.progress.goals(self.misjudgement.unknown)
+        current, following = self.progress.goals(self.misjudgement.untyped())
         coming = self.progress.next_obstacle
         shift = self.misjudgement.expected(self.layout.axis(coming))
         return torch.stack((current, following + shift * (coming != self.progress.obstacle)[:, None]), 1)
@@ -204,7 +204,7 @@ class Arena:
     def expected_type(self) -> Tensor:
         """Type of the current obstacle, one-hot ``[N, 7]``; as far as it is unknown to those robots, of none."""
         kinds = self.types[self.progress.obstacle].float()
-        return kinds if self.misjudgement is None else kinds * (1.0 - self.misjudgement.unknown[:, None])
+        return kinds if self.misjudgement is None else kinds * (1.0 - self.misjudgement.untyped()[0][:, None])
 
     def place(self, goals: Tensor, position: Tensor, yaw: Tensor) -> Tensor:
         """``keys.PLACE`` ``[N, 8]`` of robots at ``[N, 2]`` [m], yaws ``[N]`` [rad], goals ``[N, 2, 2]`` [m]."""

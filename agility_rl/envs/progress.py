@@ -120,19 +120,20 @@ class CourseProgress:
         """Current way-point in the world, ``[N, 2]`` [m]."""
         return self.layout.world(self.obstacle, self.local_goal())
 
-    def goals(self, unknown: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def goals(self, unknown: tuple[Tensor, Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Current and next way-point in the world, each ``[N, 2]`` [m].
 
         Args:
-            unknown: of the current obstacle's type, ``[N]`` from 0 to 1. As far as it is, and for the next obstacle,
-                way-points are then where those of all obstacles of the course are on average.
+            unknown: of the types of the current obstacle and of the next one, each ``[N]`` from 0 to 1. As far as they
+                are, way-points are where those of all obstacles of the course are on average.
         """
         leg, point = self._after()
         coming = self._obstacle(leg)
         now, after = self.local_goal(), self._points[coming, point]
         if unknown is not None:
-            elsewhere = torch.where(coming == self.obstacle, unknown, 1.0)
-            now = now.lerp(self._usual[self.point], unknown[:, None])
+            here, further = unknown
+            elsewhere = torch.where(coming == self.obstacle, here, further)
+            now = now.lerp(self._usual[self.point], here[:, None])
             after = after.lerp(self._usual[point], elsewhere[:, None])
         current, following = self.layout.world(self.obstacle, now), self.layout.world(coming, after)
         beyond = current + self._beyond

@@ -137,6 +137,7 @@ class DistanceField(nn.Module):
     def __init__(self, types: Sequence[Sequence[Solid]]) -> None:
         super().__init__()
         values = _values(_frozen(types))
+        self.count = len(values)
         self.size, *strides = values.stride()
         steps = torch.tensor(list(itertools.product((0, 1), repeat=3)))
         for name, value in {

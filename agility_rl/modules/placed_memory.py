@@ -12,6 +12,7 @@ from agility_rl.modules.glance import NUM_POSE, NUM_SCALES, Glance
 from agility_rl.modules.kalman import corrected
 from agility_rl.modules.mlp import mlp
 from agility_rl.modules.planar import bearings, inverse, inverted, moved, planar_motion, seen_from, within
+from agility_rl.modules.preview import Preview
 from agility_rl.modules.scan_matching import NOTHING, NUM_MATCH, ScanMatcher
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 
@@ -24,9 +25,6 @@ DRIFT = (0.05**2, 0.05**2, 0.01**2)
 START = (0.15**2, 0.45**2, 0.2**2)
 """Variance where an episode starts, 2 m before an obstacle and up to 0.4 rad turned: that of the draw, twice as wide as
 the released one (method notes, section 5.7)."""
-NEXT = (0.2**2, 0.29**2, 0.07**2)
-"""Variance that the jitter of an obstacle and of the next one adds (section 5.7): 0.15 m along, 0.25 m across and 0.087
-rad at most, of each; what stands 4 m behind one that is turned so far is 0.35 m aside."""
 ALIKE = 3.2
 """Logarithm of how many images in a row count as one at the start: their errors are alike."""
 CREDIT = -4.0
@@ -39,14 +37,15 @@ CERTAIN = 8.0
 """Logit of the way-point where an episode starts."""
 
 
-def memory_parts(hidden_size: int, legs: int, points: int) -> tuple[int, int, int, int]:
-    """Numbers of the memory: of the GRU, the pose, its uncertainty, and the way-points that it may be on the way to.
+def memory_parts(hidden_size: int, legs: int, points: int, types: int) -> tuple[int, int, int, int, int]:
+    """Numbers of the memory: of the GRU, the pose, its uncertainty, the way-points that it may be on the way to, and
+    what is known of the next obstacle.
 
     Example:
-        >>> memory_parts(256, legs=6, points=4)
-        (256, 4, 3, 24)
+        >>> memory_parts(256, legs=6, points=4, types=7)
+        (256, 4, 3, 24, 21)
     """
-    return hidden_size, NUM_POSE, NUM_SCALES, legs * points
+    return hidden_size, NUM_POSE, NUM_SCALES, legs * points, Preview(types).size
 
 
 class PlacedMemory(nn.Module):
@@ -71,9 +70,10 @@ class PlacedMemory(nn.Module):
     says of each whether it is :func:`reached`, D leaves some doubt for its neighbours, and the evidence e counts by a
     share :math:`\kappa`, since images in a row are much alike, and for no obstacle where the robot cannot be
     (:func:`told_of`). The likeliest way-point says which obstacle the pose is
-    seen from and corrected by, as if that stood where it should. The place then is where the way-points of that type of
-    obstacle lie from there (:func:`~agility_rl.modules.planar.seen_from`). Who has seen nothing stands before the first
-    obstacle.
+    seen from and corrected by, as if that stood where it should; and a :class:`~agility_rl.modules.preview.Preview`,
+    where from there the next one stands, and of which type it is, as far as it has been in view when that becomes the
+    present one. The place then is where the way-points of that type of obstacle lie from there
+    (:func:`~agility_rl.modules.planar.seen_from`). Who has seen nothing stands before the first obstacle.
 
     Source: ours; prediction and correction are those of a Kalman filter (Kalman 1960, doi:10.1115/1.3662552) and of a
     hidden Markov model's forward algorithm (Rabiner 1989, doi:10.1109/5.18626, Eq. 19 and 20). Sizes of fusion and GRU:
@@ -92,28 +92,28 @@ class PlacedMemory(nn.Module):
         solids: ``[K][...]``, what every type of obstacle is made of; without, nothing is matched.
 
     Attributes:
-        size: of the memory: units of the GRU, the pose half a decision later, the variances of x, y and yaw, and the
-            belief in L x W way-points as logits, the last three less what they are before the first obstacle.
+        size: of the memory: units of the GRU, the pose half a decision later, the variances of x, y and yaw, the
+            belief in L x W way-points as logits, these three less what they are before the first obstacle, and what is
+            known of the next obstacle.
 
     Example:
         >>> memory = PlacedMemory(32, 45, 16, 7, 0.04, torch.zeros(7, 4, 2), [[(2.0, 3.0, 1.57), (2.0, 7.0, 1.57)]])
         >>> outputs = memory(torch.zeros(5, 3, 32), torch.zeros(5, 3, 45), torch.zeros(5, 3, 4),
         ...     torch.zeros(5, 3, 58, 87), torch.zeros(5, 3, memory.size), torch.zeros(5, 3, 1, dtype=torch.bool))
         >>> [tuple(output.shape) for output in outputs]
-        [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 31), (5, 3, 8), (5, 3, 8), (5, 3, 7)]
+        [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 52), (5, 3, 8), (5, 3, 8), (5, 3, 21)]
     """
 
     way_points: Tensor
-    entry: Tensor
     legs: Tensor
     arena: Tensor
     following: Tensor
+    next_leg: Tensor
     doubt: Tensor
     prior: Tensor
     starts: Tensor
     drift: Tensor
     uncertain: Tensor
-    jitter: Tensor
 
     def __init__(
         self,
@@ -135,8 +135,10 @@ class PlacedMemory(nn.Module):
         following = torch.tensor([index if index in ends else index + 1 for index in range(count)])
         preceding = torch.tensor([index if firsts[index] else index - 1 for index in range(count)])
         self.hidden_size, self.period, self.points = hidden_size, period, points
-        self.parts = memory_parts(hidden_size, legs, points)
+        self.preview = Preview(num_obstacles)
+        self.parts = memory_parts(hidden_size, legs, points, num_obstacles)
         self.size = sum(self.parts)
+        self.said = NUM_MATCH + self.preview.said
         self.fusion = mlp(features + measured + NUM_POSE + legs + points, (128,), 32)
         self.cell = nn.GRUCell(32, hidden_size)
         self.known = (NUM_TERRAIN_LATENT, num_obstacles, count)
@@ -145,20 +147,18 @@ class PlacedMemory(nn.Module):
         self.matcher = ScanMatcher(solids) if solids else None
 
         stay, frames = torch.eye(count), torch.tensor([leg for route in routes for leg in route])
-        entry = way_points[:, 0].mean(0, keepdim=True)
-        before = torch.cat((entry[0], torch.tensor([0.0, 1.0])))
+        before = torch.cat((way_points[:, 0].mean(0), torch.tensor([0.0, 1.0])))
         constants = {
             "way_points": way_points,
-            "entry": entry,
             "legs": frames,
             "arena": inverse(frames),
             "following": following,
+            "next_leg": following[points - 1 :: points] // points,
             "doubt": (1.0 - 2.0 * DOUBT) * stay + DOUBT * (stay[following] + stay[preceding]),
             "prior": CERTAIN * torch.tensor(firsts).float(),
             "starts": within(before, inverse(frames)),
             "drift": period * torch.tensor(DRIFT),
             "uncertain": torch.tensor(START),
-            "jitter": torch.tensor(NEXT),
         }
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)
@@ -173,9 +173,10 @@ class PlacedMemory(nn.Module):
         is_init: Tensor,
         start: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """Steps of ``[T, *B]``: latent, heading errors [rad], obstacle logits, memory after, place, progress, match.
+        """Steps of ``[T, *B]``: latent, heading errors [rad], obstacle logits, memory after, place, progress, matches.
 
-        Progress are log-probabilities. ``look`` is an image ``[58, 87]``, or the match that came of it.
+        Progress are log-probabilities. ``look`` is an image ``[58, 87]``, or what came of it: the match of the present
+        obstacle, that of the next one, and what speaks for its types.
         Of ``hidden`` only the first step's counts; it begins as :meth:`begun` does.
         """
         state, steps = hidden[0], []
@@ -192,17 +193,20 @@ class PlacedMemory(nn.Module):
         """
         if start is None:
             return hidden.masked_fill(is_init, 0.0)
-        empty = hidden.new_zeros(*hidden.shape[:-1], self.hidden_size)
+        sizes = (self.hidden_size, NUM_SCALES, self.preview.size)
+        empty, unsure, unseen = (hidden.new_zeros(*hidden.shape[:-1], size) for size in sizes)
         pose = self._marginals(start)[0] @ self.starts - self.starts[0]
         return torch.where(
-            is_init, torch.cat((empty, pose, empty[..., :NUM_SCALES], CERTAIN * start - self.prior), -1), hidden
+            is_init,
+            torch.cat((empty, pose, unsure, CERTAIN * start - self.prior, unseen), -1),
+            hidden,
         )
 
     def step(
         self, feature: Tensor, proprioception: Tensor, estimate: Tensor, look: Tensor, hidden: Tensor
     ) -> tuple[Tensor, ...]:
         """One step of ``[*B]``, with outputs as :meth:`forward`."""
-        remembered, pose, variance, belief = hidden.split(self.parts, -1)
+        remembered, pose, variance, belief, coming = hidden.split(self.parts, -1)
         belief = (belief + self.prior).softmax(-1)
         variance = (variance + self.uncertain).clamp(min=0.0) + self.drift
         motion = 0.5 * self.period * planar_motion(proprioception, estimate)
@@ -212,8 +216,8 @@ class PlacedMemory(nn.Module):
         expected = torch.cat((of_leg(at, before), *self._marginals(belief)), -1)
         remembered = self._remember(torch.cat((feature, proprioception, expected.detach()), -1), remembered)
         known, alike, weight = self.head(remembered).split((sum(self.known), NUM_SCALES, 1), -1)
-        latent, logits, evidence = (known + self.glance.what(feature)).split(self.known, -1)
-        points = torch.einsum("...k,kwc->...wc", logits.detach().softmax(-1), self.way_points)
+        latent, seems, evidence = (known + self.glance.what(feature)).split(self.known, -1)
+        points = self._points(seems + self.preview.hints(coming)[1])
 
         done = reached(points[..., None, :, :] - at[..., None, :2]).flatten(-2)
         belief = (belief * (-done).sigmoid()).index_add(-1, self.following, belief * done.sigmoid())
@@ -222,39 +226,67 @@ class PlacedMemory(nn.Module):
         progress = told.flatten(-2)
         now = progress.argmax(-1)
         leg = now // self.points
-        variance = torch.where((leg != before)[..., None], variance + self.jitter, variance)
-        ahead = inverted(of_leg(at, leg))
+        changed, onwards = (leg != before)[..., None], (leg == self.next_leg[before])[..., None]
+        variance = torch.where(changed, variance + self.preview.variance(coming), variance)
+        local = of_leg(at, leg)
+        ahead = inverted(torch.where(changed & onwards, self.preview.place(coming, local), local))
+        coming = torch.where(changed, self.preview.arrived(coming, onwards), coming)
+        logits = seems + self.preview.hints(coming)[1]
         said, scale = self.glance.where(feature, ahead, leg)
         ahead, variance = corrected(ahead, variance, said, 2.0 * (2.0 * scale + alike + ALIKE).exp())
-        match = self._match(look, proprioception, estimate, ahead, logits.argmax(-1))
+        measured = look, proprioception, estimate
+        match = self._match(*measured, ahead, logits.argmax(-1))
         ahead, variance = corrected(ahead, variance, *match.split((NUM_POSE, NUM_SCALES), -1))
         obstacle = inverted(ahead)
         pose = of_leg(within(obstacle, self.arena), leg)
-        place = torch.cat((self._goals(now, pose, obstacle, points), obstacle), -1)
-        after = (remembered, moved(pose, motion) - self.starts[0], variance - self.uncertain, progress - self.prior)
-        return latent.tanh(), bearings(place), logits, torch.cat(after, -1), place, progress, match
+        slot = of_leg(within(pose, self.legs), self.next_leg[leg]).detach()
+        sight = self._sight(*measured, coming, slot, self.next_leg[leg] != leg)
+        coming = self.preview.told(coming, slot, sight)
+        place = torch.cat((self._goals(now, obstacle, self._points(logits), coming, slot), obstacle), -1)
+        pose = moved(pose, motion) - self.starts[0]
+        after = (remembered, pose, variance - self.uncertain, progress - self.prior, coming)
+        said = torch.cat((match, sight), -1)
+        return latent.tanh(), bearings(place), logits, torch.cat(after, -1), place, progress, said
 
     def _match(self, look: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor, kind: Tensor) -> Tensor:
         """What the shape of an obstacle says of where it stands, ``[*B, 7]``."""
-        if look.shape[-1] == NUM_MATCH:
-            return look
+        if look.shape[-1] == self.said:
+            return look[..., :NUM_MATCH]
         if self.matcher is None:
             return torch.cat((expected, torch.full_like(expected[..., :NUM_SCALES], NOTHING)), -1).detach()
         rows = (part.reshape(-1, part.shape[-1]) for part in (proprioception, estimate, expected))
         match: Tensor = self.matcher(look.reshape(-1, *look.shape[-2:]), *rows, kind.reshape(-1))
         return match.reshape(*expected.shape[:-1], NUM_MATCH)
 
+    def _sight(
+        self, look: Tensor, proprioception: Tensor, estimate: Tensor, coming: Tensor, slot: Tensor, is_next: Tensor
+    ) -> Tensor:
+        """What shapes say of the next obstacle, ``[*B, 7 + K]``."""
+        if look.shape[-1] == self.said:
+            return look[..., NUM_MATCH:]
+        if self.matcher is None:
+            return self.preview.silence(coming, slot)
+        images, going = look.reshape(-1, *look.shape[-2:]), is_next.reshape(-1)
+        rows = (part.reshape(-1, part.shape[-1]) for part in (proprioception, estimate, coming, slot))
+        sight = self.preview.look(self.matcher, going, images, *rows)
+        return sight.reshape(*slot.shape[:-1], -1)
+
     def _remember(self, inputs: Tensor, remembered: Tensor) -> Tensor:
         fused = self.fusion(inputs)
         cells = self.cell(fused.reshape(-1, fused.shape[-1]), remembered.reshape(-1, self.hidden_size))
         return cells.reshape(remembered.shape)
 
-    def _goals(self, now: Tensor, pose: Tensor, obstacle: Tensor, points: Tensor) -> Tensor:
+    def _points(self, logits: Tensor) -> Tensor:
+        """Way-points of an obstacle in its frame ``[*B, W, 2]``, by the types that it may be."""
+        return torch.einsum("...k,kwc->...wc", logits.detach().softmax(-1), self.way_points)
+
+    def _goals(self, now: Tensor, obstacle: Tensor, points: Tensor, coming: Tensor, slot: Tensor) -> Tensor:
         """The way-point ``now`` and the one after it, seen from the robot: ``[*B, 4]``."""
         following = self.following[now]
-        coming = of_leg(within(pose, self.legs), following // self.points)
-        # After the last way-point of an obstacle, whose type nobody knows yet, comes where obstacles are entered.
-        candidates = torch.cat((seen_from(obstacle, points), seen_from(coming, self.entry)), -2)
+        # After the last way-point of an obstacle comes where the next one is entered, by the types that it may be.
+        entry = self._points(self.preview.hints(coming)[0])[..., :1, :]
+        entered = seen_from(self.preview.place(coming, slot), entry)
+        candidates = torch.cat((seen_from(obstacle, points), entered), -2)
         first = now % self.points
         second = torch.where(following == now, first, first + 1)
         return candidates.take_along_dim(torch.stack((first, second), -1)[..., None], -2).flatten(-2)
@@ -267,11 +299,10 @@ class PlacedMemory(nn.Module):
         """
         now = belief.argmax(-1)
         leg = (now // self.points)[..., None]
-        nexts = self.following[self.points - 1 :: self.points] // self.points  # of every leg
-        legs = torch.arange(len(nexts), device=belief.device)
+        legs = torch.arange(len(self.next_leg), device=belief.device)
         left = of_leg(at, leg[..., 0])[..., :1] > points[..., -1, :1] - LEAVING
         first = (now % self.points == 0)[..., None]
-        return (legs == leg) | ((legs == nexts[leg]) & left) | ((nexts == leg) & first)
+        return (legs == leg) | ((legs == self.next_leg[leg]) & left) | ((self.next_leg == leg) & first)
 
     def _marginals(self, belief: Tensor) -> tuple[Tensor, Tensor]:
         """Of legs ``[*B, L]``, and of how many way-points of an obstacle are reached ``[*B, W]``."""

@@ -77,6 +77,35 @@ def inverted(pose: Tensor) -> Tensor:
     return torch.stack((-cosine * x - sine * y, sine * x - cosine * y, -sine, cosine), -1)
 
 
+def composed(pose: Tensor, other: Tensor) -> Tensor:
+    r"""A pose that is given as seen from another one.
+
+    .. math:: (x, y) + R(\psi)\,(x', y'), \qquad \psi + \psi'
+
+    Source: ours; a turn and a shift of the plane.
+
+    Args:
+        pose: ``[*B, 4]``: x, y [m], sine and cosine of the yaw.
+        other: ``[*B, 4]``, in the frame of the first.
+
+    Example:
+        >>> left = torch.tensor([1.0, 0.0, 1.0, 0.0])
+        >>> composed(left, torch.tensor([2.0, 0.5, -1.0, 0.0]))
+        tensor([0.5000, 2.0000, 0.0000, 1.0000])
+    """
+    x, y, sine, cosine = pose.unbind(-1)
+    ahead, left, sin, cos = other.unbind(-1)
+    return torch.stack(
+        (
+            x + cosine * ahead - sine * left,
+            y + sine * ahead + cosine * left,
+            sine * cos + cosine * sin,
+            cosine * cos - sine * sin,
+        ),
+        -1,
+    )
+
+
 def inverse(frames: Tensor) -> Tensor:
     """The frames ``[L, 3]`` in which what :func:`within` gives is the pose again.
 
@@ -143,17 +172,7 @@ def moved(pose: Tensor, motion: Tensor) -> Tensor:
         tensor([-1.5000,  0.0000,  1.0000, -0.0000])
     """
     forward, left, turn = motion.unbind(-1)
-    x, y, sine, cosine = pose.unbind(-1)
-    cos, sin = turn.cos(), turn.sin()
-    return torch.stack(
-        (
-            x + cosine * forward - sine * left,
-            y + sine * forward + cosine * left,
-            sine * cos + cosine * sin,
-            cosine * cos - sine * sin,
-        ),
-        -1,
-    )
+    return composed(pose, torch.stack((forward, left, turn.sin(), turn.cos()), -1))
 
 
 def bearings(place: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from agility_rl.go2 import camera, constants
 from agility_rl.modules.distance_field import DistanceField, Solid
 from agility_rl.modules.glance import NUM_POSE, NUM_SCALES
-from agility_rl.modules.planar import attitude, inverted, moved, planar_motion
+from agility_rl.modules.planar import attitude, inverted, moved, planar_motion, seen_from
 
 NUM_MATCH = NUM_POSE + NUM_SCALES
 """Numbers of a match: where the obstacle is seen, and the variances of that."""
@@ -44,6 +45,41 @@ HELD = (1.0, 0.1, 0.1)
 there points only begin to leave the surface (docs/student.md)."""
 NOTHING = 1e6
 """Variance of what says nothing."""
+AROUND = (2.3, 1.1)
+"""Of an obstacle whose type is asked for, points so far along and across its middle count at most [m]: the obstacles
+beside it begin 1.2 m from there."""
+FEW, MANY = 12, 60
+"""With fewer raised points there nothing is said of its type; more than that say no more."""
+MOST = 0.6
+"""Share of them that its type explains, if it is to say where it stands."""
+
+
+class _Scan(NamedTuple):
+    """Points that an image measures, and from where the obstacle is expected."""
+
+    start: Tensor
+    """Pose of the robot at the obstacle when the image was taken, ``[N, 7]``."""
+    motion: Tensor
+    """Since then, ``[N, 3]``."""
+    points: Tensor
+    """``[N, P, 3]``, in the trunk's frame [m]."""
+    rays: Tensor
+    """By which they were measured, ``[N, P, 3]``."""
+    valid: Tensor
+    """Which of them were, bool ``[N, P]``."""
+
+
+class _Fit(NamedTuple):
+    """Where an obstacle of some type fits them."""
+
+    found: Tensor
+    """Pose ``[N, 7]``."""
+    covariance: Tensor
+    """``[N, 7, 7]``."""
+    explained: Tensor
+    """How many raised points lie on it, ``[N]``."""
+    there: Tensor
+    """Of how many where it is known, ``[N]``."""
 
 
 class ScanMatcher(nn.Module):
@@ -113,13 +149,75 @@ class ScanMatcher(nn.Module):
         Returns:
             ``[N, 7]``: as ``expected``, and variances of x, y [m^2] and yaw [rad^2], :data:`NOTHING` without a match.
         """
+        scan = self._scan(depth, proprioception, estimate, expected, (RAISED, GROUND))
+        fit = self._fit(scan, kind)
+        counts = (fit.explained > LEAST) & (fit.explained > SHARE * fit.there)
+        return self._match(scan, fit, counts)
+
+    @torch.no_grad()
+    def compare(
+        self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Where an obstacle of unknown type is seen if it is of each, and how much of what is there that explains.
+
+        Only points about the expected place are looked at, since there may be another obstacle in view.
+
+        Args:
+            depth: as :meth:`forward`, as are the next three.
+            proprioception: ``[N, 45]``.
+            estimate: ``[N, 4]``.
+            expected: ``[N, 4]``.
+
+        Returns:
+            Matches ``[N, K, 7]``, and the share of the raised points that each explains, ``[N, K]``, less where they
+            are few.
+        """
+        count = self.field.count
+        scan = self._scan(depth, proprioception, estimate, expected, (RAISED // 2, GROUND // 2), AROUND)
+        several = _Scan(*(part.repeat_interleave(count, 0) for part in scan))
+        fit = self._fit(several, torch.arange(count, device=depth.device).repeat(len(depth)))
+        share = fit.explained / fit.there.clamp(min=1)
+        match = self._match(several, fit, (fit.there >= FEW) & (share > MOST))
+        certain = (fit.there / MANY).clamp(max=1.0) * (fit.there >= FEW)
+        return match.unflatten(0, (-1, count)), (certain * share).unflatten(0, (-1, count))
+
+    def _scan(
+        self,
+        depth: Tensor,
+        proprioception: Tensor,
+        estimate: Tensor,
+        expected: Tensor,
+        most: tuple[int, int],
+        around: tuple[float, float] | None = None,
+    ) -> _Scan:
+        """At most so many points above the ground and on it, around where the obstacle is expected or anywhere."""
         motion = LATENCY * planar_motion(proprioception, estimate)
         roll_pitch, rates = attitude(proprioception)
         roll, pitch = (roll_pitch - LATENCY * rates[..., :2]).unbind(-1)
         robot = moved(inverted(expected), -motion)
         height, yaw = estimate[:, 0], torch.atan2(robot[:, 2], robot[:, 3])
         start = torch.stack((robot[:, 0], robot[:, 1], yaw, height, pitch, roll, torch.zeros_like(roll)), -1)
-        points, rays, valid = self._points(depth, height, roll, pitch)
+        metres = camera.metres(depth[..., ::STRIDE, ::STRIDE]).flatten(1)
+        points = metres[..., None] * self.rays + self.mount
+        up = torch.stack((-pitch.sin(), pitch.cos() * roll.sin(), pitch.cos() * roll.cos()), -1)
+        above = (points @ up[..., None])[..., 0] + height[:, None]
+        measured = (metres > NEAREST) & (metres < FARTHEST)
+        if around is not None:
+            offset = seen_from(inverted(robot), points[..., :2])
+            measured = measured & (offset[..., 0].abs() < around[0]) & (offset[..., 1].abs() < around[1])
+        raised = (above > ABOVE) & (above < BELOW)
+        chosen = [
+            (self.order + (measured & these)).topk(count, -1).indices
+            for these, count in zip((raised, ~raised), most, strict=True)
+        ]
+        index = torch.cat(chosen, -1)
+        fits = torch.cat((raised.gather(-1, chosen[0]), ~raised.gather(-1, chosen[1])), -1)
+        rows = index[..., None].expand(-1, -1, 3)
+        return _Scan(start, motion, points.gather(1, rows), self.rays[index], measured.gather(-1, index) & fits)
+
+    def _fit(self, scan: _Scan, kind: Tensor) -> _Fit:
+        """Gauss-Newton from where obstacles of types int64 ``[N]`` are expected."""
+        start, _, points, rays, valid = scan
         found, unsure = start, self.expected.square()
         known = torch.diag(unsure.reciprocal())
         for step in range(STEPS):
@@ -134,31 +232,15 @@ class ScanMatcher(nn.Module):
             pull = residual + (found - start) / unsure
             found = found - (covariance @ pull[..., None])[..., 0]
         raised = here[..., 2] > ABOVE
-        explained = (weight * raised).sum(-1)
-        there = (valid & covered & raised).sum(-1)
-        pose = torch.cat((found[:, :2], found[:, 2:3].sin(), found[:, 2:3].cos()), -1)
-        seen = inverted(moved(pose, motion))
-        near = torch.linalg.vector_norm((found - start)[:, :2], dim=-1) < FAR
-        counts = (explained > LEAST) & (explained > SHARE * there) & near
-        variance = self.held * _seen_variance(covariance[:, :3, :3], pose, seen) + self.floor.square()
-        return torch.cat((seen, torch.where(counts[:, None], variance, NOTHING)), -1)
+        return _Fit(found, covariance, (weight * raised).sum(-1), (valid & covered & raised).sum(-1))
 
-    def _points(self, depth: Tensor, height: Tensor, roll: Tensor, pitch: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Points in the trunk's frame and their rays, ``[N, P, 3]``, and which of them were measured."""
-        metres = camera.metres(depth[..., ::STRIDE, ::STRIDE]).flatten(1)
-        points = metres[..., None] * self.rays + self.mount
-        up = torch.stack((-pitch.sin(), pitch.cos() * roll.sin(), pitch.cos() * roll.cos()), -1)
-        above = (points @ up[..., None])[..., 0] + height[:, None]
-        measured = (metres > NEAREST) & (metres < FARTHEST)
-        raised = (above > ABOVE) & (above < BELOW)
-        chosen = [
-            (self.order + (measured & these)).topk(count, -1).indices
-            for these, count in ((raised, RAISED), (~raised, GROUND))
-        ]
-        index = torch.cat(chosen, -1)
-        fits = torch.cat((raised.gather(-1, chosen[0]), ~raised.gather(-1, chosen[1])), -1)
-        rows = index[..., None].expand(-1, -1, 3)
-        return points.gather(1, rows), self.rays[index], measured.gather(-1, index) & fits
+    def _match(self, scan: _Scan, fit: _Fit, counts: Tensor) -> Tensor:
+        """What a fit says, ``[N, 7]``, of those that count and are not too far off."""
+        pose = torch.cat((fit.found[:, :2], fit.found[:, 2:3].sin(), fit.found[:, 2:3].cos()), -1)
+        seen = inverted(moved(pose, scan.motion))
+        near = torch.linalg.vector_norm((fit.found - scan.start)[:, :2], dim=-1) < FAR
+        variance = self.held * _seen_variance(fit.covariance[:, :3, :3], pose, seen) + self.floor.square()
+        return torch.cat((seen, torch.where((counts & near)[:, None], variance, NOTHING)), -1)
 
 
 def _placed(pose: Tensor, points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:

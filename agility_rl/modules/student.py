@@ -53,13 +53,13 @@ class RecurrentStudent(nn.Module):
     the episode (the release carries it on).
 
     Keys read: ``depth`` [*B, 58, 87], ``proprioception`` [*B, 45], ``history`` [*B, 10, 45], ``hidden`` [*B, 512]
-    (with ``num_place`` 7 more, and one for every way-point of the course),
+    (with ``num_place`` 7 more, one for every way-point of the course, and 7 and two for every type of obstacle),
     ``is_init`` bool [*B, 1], true in the first step of an episode; with assistance ``heading_error`` [*B, 2] too, and
     with ``num_place`` also ``progress`` [*B, S], of which the first of an episode counts.
     Keys written: ``depth_feature`` [*B, F], ``terrain_latent`` [*B, 32], ``heading_estimate`` [*B, 2],
     ``obstacle_logits`` [*B, 7], ``(memory, hidden)`` [*B, 512], ``(perceived, heading_error)``,
     ``(perceived, obstacle)``, with ``num_place`` also ``place_estimate`` [*B, 8], ``progress_logits`` [*B, S],
-    ``scan_match`` [*B, 7] and ``(perceived, place)``,
+    ``scan_match`` [*B, 21] and ``(perceived, place)``,
     ``estimate``, ``latent`` and those of :class:`~agility_rl.modules.HybridActor`.
 
     Args:

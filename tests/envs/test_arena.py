@@ -233,9 +233,13 @@ def test_obstacles_that_nobody_has_seen_have_usual_way_points_and_no_type() -> N
     usual = torch.tensor([slot.goals for slot in COURSES["full"].slots]).mean(0)
     for unknown in (1.0, 0.25, 0.0):
         errors.unknown.fill_(unknown)
+        errors.guessed.zero_()
         own = arena.layout.local_to(obstacle, arena.expected_goals()[:, 0])
         torch.testing.assert_close(own, arena.progress.local_goal().lerp(usual[0].expand(200, 2), unknown))
         assert torch.equal(arena.expected_type(), (1.0 - unknown) * arena.types[obstacle])
+        errors.guessed.fill_(True)
+        assert torch.equal(arena.expected_type(), arena.types[obstacle].float())
+    errors.foreseen.zero_()
     arena.progress.point.fill_(3)  # the last one of every obstacle
     goals, coming = torch.stack(arena.progress.goals(), 1), arena.progress.next_obstacle
     further = arena.progress.leg + 1 < arena.progress.end
@@ -244,3 +248,7 @@ def test_obstacles_that_nobody_has_seen_have_usual_way_points_and_no_type() -> N
     shift = arena.layout.local_to(coming, expected[:, 1])[further] - usual[0]
     wanted = -errors.upcoming[rows[further], :2] * torch.tensor(UNSEEN[:2])
     torch.testing.assert_close(shift, wanted, atol=1e-5, rtol=0)
+    errors.foreseen.fill_(True)
+    foreseen = arena.layout.local_to(coming, arena.expected_goals()[:, 1])[further]
+    own = arena.layout.local_to(coming, goals[:, 1])[further]
+    torch.testing.assert_close(foreseen, own + wanted, atol=1e-5, rtol=0)

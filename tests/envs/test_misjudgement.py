@@ -7,7 +7,17 @@ import math
 import pytest
 import torch
 
-from agility_rl.envs.misjudgement import LASTING, RECOGNITION, SEEN, UNSEEN, VIEW_ANGLE, VIEW_DISTANCE, Misjudgement
+from agility_rl.envs.misjudgement import (
+    GUESSED,
+    LASTING,
+    RECOGNITION,
+    SEEN,
+    SPREAD,
+    UNSEEN,
+    VIEW_ANGLE,
+    VIEW_DISTANCE,
+    Misjudgement,
+)
 
 N = 4000
 EVERY = torch.ones(N, dtype=torch.bool)
@@ -34,9 +44,11 @@ def test_who_does_not_err_is_told_the_truth() -> None:
 def test_who_has_seen_his_obstacle_sees_it_beside_where_it_is() -> None:
     made = errors(factor=2.0)
     made.unknown.zero_()
+    assert made.scale.log().mean().item() == pytest.approx(0.0, abs=0.04)
+    assert made.scale.log().std().item() == pytest.approx(SPREAD, rel=0.05)
     local, turned = torch.tensor([-1.5, 2.0]).expand(N, 2), torch.full((N,), 2.5)
     where, heading = made.misjudged(local, turned)
-    off = torch.cat((seen(where, heading) - seen(local, turned), (heading - turned)[:, None]), -1)
+    off = torch.cat((seen(where, heading) - seen(local, turned), (heading - turned)[:, None]), -1) / made.scale[:, None]
     assert off.mean(0).abs().max() < 0.01
     assert off.std(0).tolist() == pytest.approx([2.0 * size for size in SEEN], rel=0.05)
     assert torch.corrcoef(off.T).fill_diagonal_(0.0).abs().max() < 0.06
@@ -78,13 +90,28 @@ def test_what_comes_into_view_is_recognised(x: float, y: float, yaw: float, in_v
 def test_the_next_obstacle_is_unseen_and_stands_where_it_was_expected() -> None:
     made = errors()
     changed = torch.arange(N) < N // 2
-    unseen, upcoming = made.unseen.clone(), made.upcoming.clone()
+    before = made.state_dict()
+    unseen, upcoming = before["unseen"], before["upcoming"]
     made.unknown.fill_(0.2)
     made.advance(changed, torch.full((N, 2), 5.0), torch.zeros(N))
     assert torch.equal(made.unseen, torch.where(changed[:, None], upcoming, unseen))
     assert torch.equal((made.upcoming != upcoming).all(-1), changed)
     assert torch.equal(made.unknown, torch.where(changed, 1.0, 0.2))
     assert made.upcoming.std().item() == pytest.approx(1.0, rel=0.03)
+    assert torch.equal(made.scale != before["scale"], changed)
+    assert torch.equal(made.guessed, torch.where(changed, before["foreseen"], before["guessed"]))
+    other = made.foreseen != before["foreseen"]
+    assert other[changed].any() and not other[~changed].any()
+
+
+def test_a_type_may_be_known_before_the_obstacle_is_in_view() -> None:
+    made = errors()
+    for known in (made.guessed, made.foreseen):
+        assert known.float().mean().item() == pytest.approx(GUESSED, abs=0.02)
+    made.unknown.fill_(0.4)
+    present, coming = made.untyped()
+    torch.testing.assert_close(present, torch.where(made.guessed, 0.0, 0.4))
+    torch.testing.assert_close(coming, torch.where(made.foreseen, 0.0, 1.0))
 
 
 def test_where_the_next_obstacle_is_expected_is_where_it_is_thought_to_be_later() -> None:
@@ -113,7 +140,8 @@ def test_only_episodes_that_begin_draw_anew_and_a_saved_state_goes_on_alike() ->
     before, mask = made.state_dict(), torch.arange(N) < 10
     made.begin(mask)
     for name, then in before.items():
-        assert torch.equal((getattr(made, name) != then).view(N, -1).any(-1), mask)
+        differs = (getattr(made, name) != then).view(N, -1).any(-1)
+        assert not (differs & ~mask).any() and (name in ("guessed", "foreseen") or torch.equal(differs, mask))
     other = errors(period=0.04)
     other.load_state_dict(made.state_dict())
     other.generator.set_state(made.generator.get_state())
@@ -123,7 +151,7 @@ def test_only_episodes_that_begin_draw_anew_and_a_saved_state_goes_on_alike() ->
 
 
 def test_a_state_of_other_errors_is_refused() -> None:
-    with pytest.raises(ValueError, match="errors seen, unseen, upcoming, unknown of a misjudged place, got error"):
+    with pytest.raises(ValueError, match="guessed, foreseen of a misjudged place, got error"):
         errors().load_state_dict({"error": torch.zeros(N, 3)})
 
 

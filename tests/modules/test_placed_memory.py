@@ -7,8 +7,9 @@ import torch
 
 from agility_rl.envs.course_presets import COURSES
 from agility_rl.go2 import camera, features
-from agility_rl.modules.placed_memory import ALIKE, DRIFT, NEXT, START, PlacedMemory
+from agility_rl.modules.placed_memory import ALIKE, DRIFT, START, PlacedMemory
 from agility_rl.modules.planar import moved
+from agility_rl.modules.preview import NEXT, STRONGEST
 from agility_rl.modules.scan_matching import NOTHING, ScanMatcher
 
 POINTS = torch.tensor([-1.5, -0.5, 0.5, 1.5])[:, None] * torch.tensor([1.0, 0.0]).expand(7, 1, 2)
@@ -35,13 +36,22 @@ def silent(*routes: tuple[tuple[float, float, float], ...]) -> tuple[PlacedMemor
 
 def still(memory: PlacedMemory, pose: list[float], at: int | None = None) -> tuple[torch.Tensor, ...]:
     """Inputs of a step in which nothing moves: a pose in the arena, and a way-point that is certain."""
-    belief = torch.zeros(memory.parts[-1])
+    belief = torch.zeros(memory.parts[3])
     if at is not None:
         belief = belief - 30.0
         belief[at] = 0.0
     before = torch.cat((torch.tensor(pose) - memory.starts[0], torch.zeros(3), belief - memory.prior))
     seen = torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4), torch.zeros(1, 58, 87)
-    return *seen, torch.cat((torch.zeros(8), before))[None]
+    return *seen, torch.cat((torch.zeros(8), before, torch.zeros(memory.preview.size)))[None]
+
+
+def said(memory: PlacedMemory, present: torch.Tensor, coming: torch.Tensor) -> torch.Tensor:
+    """What an image said of the present obstacle and of the next one, ``[1, 21]``."""
+    return torch.cat((present, coming))[None]
+
+
+UNSEEN = torch.tensor([0.0, 0.0, 0.0, 1.0, *(NOTHING,) * 3])
+"""A match that says nothing."""
 
 
 @torch.no_grad()
@@ -89,7 +99,8 @@ def test_a_match_corrects_what_a_glance_has_left() -> None:
     memory, _ = silent()
     *seen, hidden = still(memory, [-1.0, 0.0, 0.0, 1.0], 1)
     variance = torch.tensor(START) + 0.05 * torch.tensor(DRIFT)
-    seen[3] = torch.cat((torch.tensor([0.8, 0.0, 0.0, 1.0]), variance))[None]
+    present = torch.cat((torch.tensor([0.8, 0.0, 0.0, 1.0]), variance))
+    seen[3] = said(memory, present, torch.cat((UNSEEN, torch.zeros(7))))
     *_, after, place, _, match = memory.step(*seen, hidden)
     torch.testing.assert_close(place[0, 4:], torch.tensor([-0.9, 0.0, 0.0, 1.0]), atol=2e-4, rtol=0.0)
     torch.testing.assert_close(after[0, 12:15] + torch.tensor(START), variance / 2.0, rtol=2e-3, atol=0.0)
@@ -109,7 +120,7 @@ def test_what_is_matched_is_the_shape_of_the_likeliest_obstacle() -> None:
         bias["obstacle"][likeliest] = 20.0
         feature, proprioception, _, _, hidden = still(memory, [-2.2, 0.0, 0.0, 1.0], 1)
         *_, match = memory.step(feature, proprioception, torch.tensor([[0.27, 0.0, 0.0, 0.0]]), image, hidden)
-        assert bool(match[0, 4] < NOTHING) == there
+        assert bool(match[0, 4] < NOTHING) == there and bool(match[0, 11] == NOTHING)
         assert (match[0, 0].item() == pytest.approx(2.305, abs=0.01)) == there
 
 
@@ -171,6 +182,57 @@ def test_who_reaches_the_last_way_point_stands_before_the_next_obstacle() -> Non
 
 
 @torch.no_grad()
+def test_what_was_seen_of_the_next_obstacle_counts_when_that_is_the_present_one() -> None:
+    """From 1 m behind the first obstacle's middle the next one is seen 3.2 m ahead and 0.1 m to the left, turned by 0.2
+    instead of 3 m ahead, and taken for the fourth type; its way-points all lie 1 m further than others'.
+
+    Where it is entered follows that at once. 0.6 m on, the last way-point is reached: the robot is 2.6 m before it and
+    to the right, and turned to the other side.
+    """
+    memory, _ = silent((FIRST, STRAIGHT))
+    memory.way_points[3, :, 0] += 1.0
+    memory.preview.alike.zero_()
+    *seen, state = still(memory, [3.0, 3.0, 0.0, 1.0], 3)
+    there = torch.tensor([3.2, 0.1, math.sin(0.2), math.cos(0.2)])
+    evidence = torch.tensor([0.0, 0.0, 0.0, 2.0 * STRONGEST, 0.0, 0.0, 0.0])
+    coming = torch.cat((there, torch.full((3,), 1e-6), evidence))
+    seen[3] = said(memory, UNSEEN, coming)
+    *_, state, place, _, _ = memory.step(*seen, state)
+    entry = -1.5 + 1.0 / (1.0 + 6.0 * math.exp(-STRONGEST))  # along its axis, by the types that it may be
+    expected = there[:2] + entry * torch.tensor([math.cos(0.2), math.sin(0.2)])
+    torch.testing.assert_close(place[0, 2:4], expected, atol=2e-3, rtol=0.0)
+    torch.testing.assert_close(place[0, 4:], torch.tensor([1.0, 0.0, 0.0, 1.0]), atol=1e-4, rtol=0.0)
+
+    state[0, 8] += 0.6
+    seen[3] = said(memory, UNSEEN, torch.cat((UNSEEN, torch.zeros(7))))
+    _, _, logits, state, place, progress, _ = memory.step(*seen, state)
+    assert int(progress.argmax()) == 4 and int(logits.argmax()) == 3
+    assert float(logits[0, 3] - logits[0, 0]) == pytest.approx(STRONGEST)
+    x, y = math.cos(0.2) * 2.6 + math.sin(0.2) * 0.1, math.cos(0.2) * 0.1 - math.sin(0.2) * 2.6
+    expected = torch.tensor([-x, -y, -math.sin(0.2), math.cos(0.2)])
+    torch.testing.assert_close(place[0, 4:], expected, atol=2e-3, rtol=0.0)
+    doubted = 0.05**2 / (1.0 + 0.05**2)  # what lies 0.22 m from where it was expected
+    known = 2.0 * 0.05 * torch.tensor(DRIFT) + doubted * torch.tensor(NEXT)
+    torch.testing.assert_close(state[0, 12:15], known, atol=3e-6, rtol=0.0)
+    torch.testing.assert_close(state[0, 23:37], torch.zeros(14), atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(state[0, 37:44], evidence.clamp(min=STRONGEST))
+
+
+@torch.no_grad()
+def test_who_goes_back_knows_nothing_of_the_obstacle_before() -> None:
+    """Evidence for the first of two, seen from the second: what was seen of the one after it says nothing of that."""
+    memory, bias = silent((FIRST, STRAIGHT, BACK))
+    bias["weight"].fill_(100.0)
+    bias["progress"][3] = 40.0
+    *seen, state = still(memory, [4.0, 3.0, 0.0, 1.0], 4)
+    state[0, -21:] = torch.rand(21)
+    *_, state, place, progress, _ = memory.step(*seen, state)
+    assert int(progress.argmax()) == 3
+    torch.testing.assert_close(state[0, -21:], torch.zeros(21), atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(place[0, 4:], torch.tensor([2.0, 0.0, 0.0, 1.0]), atol=1e-4, rtol=0.0)
+
+
+@torch.no_grad()
 def test_a_way_point_counts_until_it_is_reached() -> None:
     """The second way-point is at x = -0.5, and only where it is the present one is it passed."""
     memory, _ = silent((FIRST, STRAIGHT))
@@ -187,7 +249,7 @@ def test_evidence_multiplies_the_belief() -> None:
     bias["progress"][:2] = torch.tensor([0.0, math.log(6.0)])
     bias["weight"].fill_(4.0)
     *inputs, hidden = still(memory, [-9.0, 0.0, 0.0, 1.0], 1)
-    hidden[0, -4] = math.log(3.0) - memory.prior[0]
+    hidden[0, 15] = math.log(3.0) - memory.prior[0]
     *_, progress, _ = memory.step(*inputs, hidden)
     assert float((progress[0, 0] - progress[0, 1]).exp()) == pytest.approx(3.0 / math.sqrt(6.0), rel=1e-2)
 
@@ -248,7 +310,7 @@ def test_an_episode_begins_before_the_first_obstacle_unless_told_otherwise() -> 
 def test_routes_do_not_mix() -> None:
     """The hurdle, then the ramp or the tunnel: who is on the first route stays on it."""
     memory = PlacedMemory(32, 45, 8, 7, 0.04, POINTS, COURSES["bidirectional"].legs)
-    assert memory.parts == (8, 4, 3, 16) and memory.prior.nonzero()[:, 0].tolist() == [0, 8]
+    assert memory.parts == (8, 4, 3, 16, 21) and memory.prior.nonzero()[:, 0].tolist() == [0, 8]
     assert memory.following.tolist() == [1, 2, 3, 4, 5, 6, 7, 7, 9, 10, 11, 12, 13, 14, 15, 15]
 
 
@@ -258,8 +320,9 @@ def test_way_points_are_those_of_the_likeliest_obstacle_and_then_where_the_next_
     memory, bias = silent((FIRST, STRAIGHT))
     memory.way_points[3] += 1.0
     bias["obstacle"][3] = 20.0
-    # The entry is the mean over the types: at -1.5 in the frame of the second obstacle, which is 4 m on.
-    for at, expected in ((0, [-0.5, 0.5, 0.5, 0.5]), (3, [2.5, 0.5, 2.5, -0.5]), (7, [6.5, 0.5, 6.5, 0.5])):
+    # The entry is the mean over the types: at -1.5 + 1/7 and 1/7 in the frame of the second obstacle, which is 4 m on.
+    entry = [2.5 + 1.0 / 7.0, -0.5 + 1.0 / 7.0]
+    for at, expected in ((0, [-0.5, 0.5, 0.5, 0.5]), (3, [2.5, 0.5, *entry]), (7, [6.5, 0.5, 6.5, 0.5])):
         *_, place, _, _ = memory.step(*still(memory, [2.0, 3.5, 0.0, 1.0], at))
         torch.testing.assert_close(place[0, :4], torch.tensor(expected), atol=1e-5, rtol=0.0)
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -25,13 +26,13 @@ def matcher() -> ScanMatcher:
     return ScanMatcher(SOLIDS)
 
 
-def standing(name: str, noise: float = 0.0) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
+def standing(name: str, noise: float = 0.0, walls: bool = True) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
     """What robots that have just been stood before an obstacle measure, where they see it, and its type."""
     camera_errors = {"pitch": noise * camera.PITCH_JITTER, "offset_noise": 0.05 * noise, "pixel_noise": 0.05 * noise}
     env = AgilityEnv(
         ROBOTS,
         lambda td: td.set("action", torch.zeros(ROBOTS, 12)),
-        COURSES[name],
+        COURSES[name] if walls else replace(COURSES[name], wall_height=None),
         depth=camera_errors,
         start_spread=2.0,
         observation_noise=0.0,
@@ -169,3 +170,26 @@ def test_inverse_of_badly_scaled_matrices() -> None:
     factor = torch.randn(20, 7, 9, generator=torch.Generator().manual_seed(0))
     matrix = factor @ factor.mT + torch.diag(torch.tensor([4.0, 4.0, 25.0, 400.0, 400.0, 4444.0, 1189.0]))
     torch.testing.assert_close(inverted_spd(matrix) @ matrix, torch.eye(7).expand(20, 7, 7), atol=1e-5, rtol=0.0)
+
+
+@pytest.mark.parametrize("name", TAUGHT)
+def test_an_obstacle_is_told_from_others_by_its_shape(matcher: ScanMatcher, name: str) -> None:
+    """Of most robots before it, with all errors of the camera; and it is found nearer to where it stands."""
+    measured, seen, kind = standing(name, 1.0)
+    expected = beside(seen)
+    matches, share = matcher.compare(*measured, expected)
+    assert matches.shape == (ROBOTS, len(SOLIDS), 7) and share.shape == (ROBOTS, len(SOLIDS))
+    assert (share.argmax(-1) == kind).float().mean() > 0.8
+    match = matches[torch.arange(ROBOTS), kind]
+    found = match[:, 4] < NOTHING
+    assert found.float().mean() > 0.8
+    before, after = (errors(place, seen)[found, 1].median() for place in (expected, match))
+    assert after < 0.6 * before
+
+
+def test_what_stands_beside_says_nothing_of_the_type(matcher: ScanMatcher) -> None:
+    """A tunnel in view, an obstacle expected 2 m to its left."""
+    measured, seen, _ = standing("tunnel", walls=False)
+    beside_it = seen + torch.tensor([0.0, 2.0, 0.0, 0.0])
+    matches, share = matcher.compare(*measured, beside_it)
+    assert (share == 0.0).all() and (matches[..., 4:] == NOTHING).all()

@@ -56,7 +56,7 @@ def test_sizes_are_those_of_the_supplement() -> None:
     assert student.memory.fusion[0].in_features == 32 + 45
     assert student.memory.head[0].out_features == 32 + 2 + 7
     placed = RecurrentStudent(num_place=8, way_points=WAY_POINTS).memory
-    assert (placed.cell.input_size, placed.cell.hidden_size, placed.size) == (32, 512, 523)
+    assert (placed.cell.input_size, placed.cell.hidden_size, placed.size) == (32, 512, 544)
     assert placed.head[0].out_features == 32 + 7 + 4 + 3 + 1
 
 
@@ -105,7 +105,7 @@ def test_what_was_matched_when_it_was_seen_stands_for_the_images() -> None:
     for key in ("place_estimate", "logits", ("memory", "hidden")):
         torch.testing.assert_close(again[key], seen[key])
     seen["scan_match"][..., :2] += 0.3
-    seen["scan_match"][..., 4:] = 1e-3
+    seen["scan_match"][..., 4:7] = 1e-3
     moved = student.policy(sequence=True, seen=True)(seen.select(*student.policy(seen=True).in_keys).clone())
     assert not torch.allclose(moved["place_estimate"], again["place_estimate"], atol=0.05)
 
@@ -205,7 +205,7 @@ def test_imitation_does_not_push_the_place() -> None:
         memory=M, num_place=8, way_points=WAY_POINTS, routes=[[[2.0, 3.0, 1.5], [2.0, 7.0, 1.5]]]
     )
     torch.nn.init.normal_(student.memory.glance.correction[-1].weight)
-    td = student.policy(sequence=True)(steps(3, 2, M + 15))
+    td = student.policy(sequence=True)(steps(3, 2, student.memory.size))
     td["loc"].sum().backward(retain_graph=True)
     assert student.memory.head[0].weight.grad[32:].abs().sum() == 0
     td["place_estimate"].sum().backward(retain_graph=True)

@@ -118,7 +118,7 @@ def test_glances_move_the_encoder_and_the_imitation_the_rest(recipe: ModuleType,
     window = parts.collector.collect()
     feature = parts.student.depth_encoder(window[0].select("depth"))["depth_feature"]
     torch.testing.assert_close(window["depth_feature"][0], feature)
-    assert window["scan_match"].shape == (*window.shape, 7), "matched when it was seen, not with every pass"
+    assert window["scan_match"].shape == (*window.shape, 21), "matched when it was seen, not with every pass"
     glances = module("glances")
     window["label", "terrain_latent"] = glances.known_terrain(parts.teacher, window)
     recipe.imitate(parts, cfg, window, 0)
