@@ -25,6 +25,9 @@ RAISED, GROUND = 192, 64
 """So many points above the ground, and on it, are matched."""
 ABOVE, BELOW = 0.06, 1.6
 """Heights above the ground of the former [m]."""
+AROUND = (2.3, 1.1)
+"""So far along and across where the middle of an obstacle is expected they lie at most [m]: what stands beside it in
+the course begins 1.2 m from there."""
 STEPS = 4
 """Of Gauss and Newton."""
 WIDTH = (0.1, 0.04)
@@ -38,6 +41,11 @@ angle within 5 degrees: method notes, section 5.8)."""
 LEAST, SHARE, FAR = 15, 0.3, 0.8
 """A match counts if it explains so many of the raised points, such a share of them, and lies less than so far [m] from
 where it was expected."""
+ASIDE = 0.35
+"""So far beside the expected place fits begin too, on either side [m]: from there alone who is that wrong holds a post
+of a tire for the other (docs/student.md)."""
+BETTER = (1.05, 2.0)
+"""What such a fit explains must be more than this multiple of what the first does, and so many points more."""
 FLOOR = (0.015, 0.015, 0.008)
 """Least deviation of a match: x, y [m], yaw [rad]."""
 HELD = (1.0, 0.1, 0.1)
@@ -45,9 +53,6 @@ HELD = (1.0, 0.1, 0.1)
 there points only begin to leave the surface (docs/student.md)."""
 NOTHING = 1e6
 """Variance of what says nothing."""
-AROUND = (2.3, 1.1)
-"""Of an obstacle whose type is asked for, points so far along and across its middle count at most [m]: the obstacles
-beside it begin 1.2 m from there."""
 FEW, MANY = 12, 60
 """With fewer raised points there nothing is said of its type; more than that say no more."""
 MOST = 0.6
@@ -91,8 +96,9 @@ class ScanMatcher(nn.Module):
     :math:`p_i` are points that the image measures, d their distance from the surface of obstacle and ground
     (:class:`~agility_rl.modules.distance_field.DistanceField`), and :math:`\xi` is the robot's pose at the obstacle
     with its height, roll and pitch and the image's common error. Four steps of Gauss and Newton with weights of Geman
-    and McClure, whose width c falls. A network that reads a place from an image errs alike in image after image, and
-    holds what is usual for seen; a shape that fits does neither. It has to be expected within some 0.3 m.
+    and McClure, whose width c falls, begin where the obstacle is expected and on either side of it; the fit that
+    explains most counts. A network that reads a place from an image errs alike in image after image, and holds what is
+    usual for seen; a shape that fits does neither. It has to be expected within some 0.5 m.
 
     Source: ours; scan matching against a distance field: Fitzgibbon 2003 (doi:10.1016/j.imavis.2003.09.004).
 
@@ -117,6 +123,8 @@ class ScanMatcher(nn.Module):
     expected: Tensor
     floor: Tensor
     held: Tensor
+    around: Tensor
+    aside: Tensor
 
     def __init__(self, types: Sequence[Sequence[Solid]]) -> None:
         super().__init__()
@@ -130,6 +138,8 @@ class ScanMatcher(nn.Module):
             "expected": torch.tensor(EXPECTED),
             "floor": torch.tensor(FLOOR),
             "held": torch.tensor(HELD),
+            "around": torch.tensor(AROUND),
+            "aside": ASIDE * torch.tensor([0.0, 1.0, -1.0])[:, None, None] * torch.eye(len(EXPECTED))[1],
         }.items():
             self.register_buffer(name, value, persistent=False)
 
@@ -150,7 +160,10 @@ class ScanMatcher(nn.Module):
             ``[N, 7]``: as ``expected``, and variances of x, y [m^2] and yaw [rad^2], :data:`NOTHING` without a match.
         """
         scan = self._scan(depth, proprioception, estimate, expected, (RAISED, GROUND))
-        fit = self._fit(scan, kind)
+        count = len(self.aside)
+        several = _Scan(*(part.repeat(count, *(1,) * (part.dim() - 1)) for part in scan))
+        fits = self._fit(several, kind.repeat(count), (scan.start + self.aside).flatten(0, 1))
+        fit = _best(_Fit(*(part.unflatten(0, (count, -1)) for part in fits)))
         counts = (fit.explained > LEAST) & (fit.explained > SHARE * fit.there)
         return self._match(scan, fit, counts)
 
@@ -159,8 +172,6 @@ class ScanMatcher(nn.Module):
         self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Where an obstacle of unknown type is seen if it is of each, and how much of what is there that explains.
-
-        Only points about the expected place are looked at, since there may be another obstacle in view.
 
         Args:
             depth: as :meth:`forward`, as are the next three.
@@ -173,9 +184,9 @@ class ScanMatcher(nn.Module):
             are few.
         """
         count = self.field.count
-        scan = self._scan(depth, proprioception, estimate, expected, (RAISED // 2, GROUND // 2), AROUND)
+        scan = self._scan(depth, proprioception, estimate, expected, (RAISED // 2, GROUND // 2))
         several = _Scan(*(part.repeat_interleave(count, 0) for part in scan))
-        fit = self._fit(several, torch.arange(count, device=depth.device).repeat(len(depth)))
+        fit = self._fit(several, torch.arange(count, device=depth.device).repeat(len(depth)), several.start)
         share = fit.explained / fit.there.clamp(min=1)
         match = self._match(several, fit, (fit.there >= FEW) & (share > MOST))
         certain = (fit.there / MANY).clamp(max=1.0) * (fit.there >= FEW)
@@ -188,9 +199,8 @@ class ScanMatcher(nn.Module):
         estimate: Tensor,
         expected: Tensor,
         most: tuple[int, int],
-        around: tuple[float, float] | None = None,
     ) -> _Scan:
-        """At most so many points above the ground and on it, around where the obstacle is expected or anywhere."""
+        """At most so many points above the ground and on it, about where the obstacle is expected."""
         motion = LATENCY * planar_motion(proprioception, estimate)
         roll_pitch, rates = attitude(proprioception)
         roll, pitch = (roll_pitch - LATENCY * rates[..., :2]).unbind(-1)
@@ -201,10 +211,8 @@ class ScanMatcher(nn.Module):
         points = metres[..., None] * self.rays + self.mount
         up = torch.stack((-pitch.sin(), pitch.cos() * roll.sin(), pitch.cos() * roll.cos()), -1)
         above = (points @ up[..., None])[..., 0] + height[:, None]
-        measured = (metres > NEAREST) & (metres < FARTHEST)
-        if around is not None:
-            offset = seen_from(inverted(robot), points[..., :2])
-            measured = measured & (offset[..., 0].abs() < around[0]) & (offset[..., 1].abs() < around[1])
+        about = seen_from(inverted(robot), points[..., :2]).abs()
+        measured = (metres > NEAREST) & (metres < FARTHEST) & (about < self.around).all(-1)
         raised = (above > ABOVE) & (above < BELOW)
         chosen = [
             (self.order + (measured & these)).topk(count, -1).indices
@@ -215,10 +223,10 @@ class ScanMatcher(nn.Module):
         rows = index[..., None].expand(-1, -1, 3)
         return _Scan(start, motion, points.gather(1, rows), self.rays[index], measured.gather(-1, index) & fits)
 
-    def _fit(self, scan: _Scan, kind: Tensor) -> _Fit:
-        """Gauss-Newton from where obstacles of types int64 ``[N]`` are expected."""
+    def _fit(self, scan: _Scan, kind: Tensor, found: Tensor) -> _Fit:
+        """Gauss-Newton from poses ``[N, 7]`` at obstacles of types int64 ``[N]``."""
         start, _, points, rays, valid = scan
-        found, unsure = start, self.expected.square()
+        unsure = self.expected.square()
         known = torch.diag(unsure.reciprocal())
         for step in range(STEPS):
             width = WIDTH[0] * (WIDTH[1] / WIDTH[0]) ** (step / (STEPS - 1))
@@ -241,6 +249,14 @@ class ScanMatcher(nn.Module):
         near = torch.linalg.vector_norm((fit.found - scan.start)[:, :2], dim=-1) < FAR
         variance = self.held * _seen_variance(fit.covariance[:, :3, :3], pose, seen) + self.floor.square()
         return torch.cat((seen, torch.where((counts & near)[:, None], variance, NOTHING)), -1)
+
+
+def _best(fits: _Fit) -> _Fit:
+    """Of several fits ``[S, N, ...]`` the first one, or the one that explains clearly more: ``[N, ...]``."""
+    more = (fits.explained[1:] - BETTER[1]) / BETTER[0]
+    best = torch.cat((fits.explained[:1], more)).argmax(0)
+    rows = torch.arange(len(best), device=best.device)
+    return _Fit(*(part[best, rows] for part in fits))
 
 
 def _placed(pose: Tensor, points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:

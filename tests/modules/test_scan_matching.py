@@ -193,3 +193,17 @@ def test_what_stands_beside_says_nothing_of_the_type(matcher: ScanMatcher) -> No
     beside_it = seen + torch.tensor([0.0, 2.0, 0.0, 0.0])
     matches, share = matcher.compare(*measured, beside_it)
     assert (share == 0.0).all() and (matches[..., 4:] == NOTHING).all()
+
+
+@pytest.mark.parametrize("name", ["tire_jump", "a_frame", "tunnel"])
+@pytest.mark.parametrize("aside", [0.35, -0.35])
+def test_an_obstacle_is_found_from_far_beside_it(matcher: ScanMatcher, name: str, aside: float) -> None:
+    """Expected a tire's half width beside where it stands, where one of its posts looks like the other."""
+    measured, seen, kind = standing(name)
+    sine, cosine = seen[:, 2], seen[:, 3]  # the obstacle's own left, seen by the robot, is (-sine, cosine)
+    expected = torch.cat((seen[:, :2] + aside * torch.stack((-sine, cosine), -1), seen[:, 2:]), -1)
+    match = matcher(*measured, expected, kind)
+    off = match[:, :2] - seen[:, :2]
+    across = (cosine * off[:, 1] - sine * off[:, 0]).abs()[match[:, 4] < NOTHING]
+    assert len(across) > 0.6 * ROBOTS
+    assert (across < 0.12).float().mean() > 0.9, across
