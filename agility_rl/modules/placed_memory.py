@@ -12,7 +12,7 @@ from agility_rl.modules.glance import NUM_POSE, NUM_SCALES, Glance
 from agility_rl.modules.kalman import corrected
 from agility_rl.modules.mlp import mlp
 from agility_rl.modules.planar import bearings, inverse, inverted, moved, planar_motion, seen_from, within
-from agility_rl.modules.preview import Preview
+from agility_rl.modules.preview import Preview, preview_parts
 from agility_rl.modules.scan_matching import NOTHING, NUM_MATCH, ScanMatcher
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
 
@@ -45,7 +45,7 @@ def memory_parts(hidden_size: int, legs: int, points: int, types: int) -> tuple[
         >>> memory_parts(256, legs=6, points=4, types=7)
         (256, 4, 3, 24, 21)
     """
-    return hidden_size, NUM_POSE, NUM_SCALES, legs * points, Preview(types).size
+    return hidden_size, NUM_POSE, NUM_SCALES, legs * points, sum(preview_parts(types))
 
 
 class PlacedMemory(nn.Module):
@@ -217,7 +217,7 @@ class PlacedMemory(nn.Module):
         remembered = self._remember(torch.cat((feature, proprioception, expected.detach()), -1), remembered)
         known, alike, weight = self.head(remembered).split((sum(self.known), NUM_SCALES, 1), -1)
         latent, seems, evidence = (known + self.glance.what(feature)).split(self.known, -1)
-        points = self._points(seems + self.preview.hints(coming)[1])
+        points = self._way_points(seems + self.preview.hints(coming)[1])
 
         done = reached(points[..., None, :, :] - at[..., None, :2]).flatten(-2)
         belief = (belief * (-done).sigmoid()).index_add(-1, self.following, belief * done.sigmoid())
@@ -242,7 +242,7 @@ class PlacedMemory(nn.Module):
         slot = of_leg(within(pose, self.legs), self.next_leg[leg]).detach()
         sight = self._sight(*measured, coming, slot, self.next_leg[leg] != leg)
         coming = self.preview.told(coming, slot, sight)
-        place = torch.cat((self._goals(now, obstacle, self._points(logits), coming, slot), obstacle), -1)
+        place = torch.cat((self._goals(now, obstacle, self._way_points(logits), coming, slot), obstacle), -1)
         pose = moved(pose, motion) - self.starts[0]
         after = (remembered, pose, variance - self.uncertain, progress - self.prior, coming)
         said = torch.cat((match, sight), -1)
@@ -276,7 +276,7 @@ class PlacedMemory(nn.Module):
         cells = self.cell(fused.reshape(-1, fused.shape[-1]), remembered.reshape(-1, self.hidden_size))
         return cells.reshape(remembered.shape)
 
-    def _points(self, logits: Tensor) -> Tensor:
+    def _way_points(self, logits: Tensor) -> Tensor:
         """Way-points of an obstacle in its frame ``[*B, W, 2]``, by the types that it may be."""
         return torch.einsum("...k,kwc->...wc", logits.detach().softmax(-1), self.way_points)
 
@@ -284,7 +284,7 @@ class PlacedMemory(nn.Module):
         """The way-point ``now`` and the one after it, seen from the robot: ``[*B, 4]``."""
         following = self.following[now]
         # After the last way-point of an obstacle comes where the next one is entered, by the types that it may be.
-        entry = self._points(self.preview.hints(coming)[0])[..., :1, :]
+        entry = self._way_points(self.preview.hints(coming)[0])[..., :1, :]
         entered = seen_from(self.preview.place(coming, slot), entry)
         candidates = torch.cat((seen_from(obstacle, points), entered), -2)
         first = now % self.points

@@ -25,6 +25,17 @@ STRONGEST = 4.0
 """A type is held for that much less likely than the likeliest at most [nat], so that what is seen later can speak."""
 
 
+def preview_parts(types: int) -> tuple[int, int, int, int]:
+    """Numbers that are remembered of the next obstacle: how far it stands beside its slot, the variance of that, what
+    speaks for each type; and what spoke for those of the present one.
+
+    Example:
+        >>> preview_parts(7)
+        (4, 3, 7, 7)
+    """
+    return NUM_POSE, NUM_SCALES, types, types
+
+
 class Preview(nn.Module):
     r"""Know the next obstacle before the present one is left, by how its shape fits what images measure beside it.
 
@@ -33,7 +44,7 @@ class Preview(nn.Module):
 
     q is the robot's place at the next slot of the course, as what is known of the present obstacle says, and
     :math:`\delta` by how much the obstacle stands beside that slot. While it is in view, the shape of each type is
-    matched with the image (:meth:`~agility_rl.modules.scan_matching.ScanMatcher.compare`): types are believed in by the
+    laid onto the image (:meth:`~agility_rl.modules.scan_matching.ScanMatcher.compare`): types are believed in by the
     share s of the points that they explain, and the likeliest one's match corrects where the obstacle is seen, o
     (:func:`~agility_rl.modules.kalman.corrected`). On an S-shaped course the obstacle behind a U-turn is in view across
     the open field while the one before it is approached, and not again until the turn is over.
@@ -62,7 +73,7 @@ class Preview(nn.Module):
 
     def __init__(self, types: int) -> None:
         super().__init__()
-        self.parts = (NUM_POSE, NUM_SCALES, types, types)
+        self.parts = preview_parts(types)
         self.size = sum(self.parts)
         self.said = NUM_POSE + NUM_SCALES + types
         for name, value in {
@@ -130,11 +141,9 @@ class Preview(nn.Module):
         # An exported network cannot choose rows; elsewhere most are spared K fits.
         every = torch.arange(len(visible), device=visible.device)
         rows = every if torch.compiler.is_exporting() else every[visible]
-        measured = (part[rows] for part in (depth, proprioception, estimate, silence[:, :NUM_POSE]))
-        matches, share = matcher.compare(*measured)
-        evidence = EVIDENCE * share
-        likeliest = (self.hints(memory)[0][rows] + evidence).argmax(-1)
-        match = matches.take_along_dim(likeliest[:, None, None], 1)[:, 0]
+        measured = [part[rows] for part in (depth, proprioception, estimate, silence[:, :NUM_POSE])]
+        evidence = EVIDENCE * matcher.compare(*measured)
+        match = matcher(*measured, (self.hints(memory)[0][rows] + evidence).argmax(-1))
         said = silence.index_copy(0, rows, torch.cat((match, evidence), -1))
         return torch.where(visible[:, None], said, silence)
 

@@ -55,8 +55,6 @@ NOTHING = 1e6
 """Variance of what says nothing."""
 FEW, MANY = 12, 60
 """With fewer raised points there nothing is said of its type; more than that say no more."""
-MOST = 0.6
-"""Share of them that its type explains, if it is to say where it stands."""
 
 
 class _Scan(NamedTuple):
@@ -161,17 +159,18 @@ class ScanMatcher(nn.Module):
         """
         scan = self._scan(depth, proprioception, estimate, expected, (RAISED, GROUND))
         count = len(self.aside)
-        several = _Scan(*(part.repeat(count, *(1,) * (part.dim() - 1)) for part in scan))
-        fits = self._fit(several, kind.repeat(count), (scan.start + self.aside).flatten(0, 1))
+        fits = self._fit(_repeated(scan, count), kind.repeat(count), (scan.start + self.aside).flatten(0, 1))
         fit = _best(_Fit(*(part.unflatten(0, (count, -1)) for part in fits)))
-        counts = (fit.explained > LEAST) & (fit.explained > SHARE * fit.there)
-        return self._match(scan, fit, counts)
+        pose = torch.cat((fit.found[:, :2], fit.found[:, 2:3].sin(), fit.found[:, 2:3].cos()), -1)
+        seen = inverted(moved(pose, scan.motion))
+        near = torch.linalg.vector_norm((fit.found - scan.start)[:, :2], dim=-1) < FAR
+        counts = (fit.explained > LEAST) & (fit.explained > SHARE * fit.there) & near
+        variance = self.held * _seen_variance(fit.covariance[:, :3, :3], pose, seen) + self.floor.square()
+        return torch.cat((seen, torch.where(counts[:, None], variance, NOTHING)), -1)
 
     @torch.no_grad()
-    def compare(
-        self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Where an obstacle of unknown type is seen if it is of each, and how much of what is there that explains.
+    def compare(self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor) -> Tensor:
+        """How much of what stands where an obstacle is expected is explained if that is of each type.
 
         Args:
             depth: as :meth:`forward`, as are the next three.
@@ -180,17 +179,15 @@ class ScanMatcher(nn.Module):
             expected: ``[N, 4]``.
 
         Returns:
-            Matches ``[N, K, 7]``, and the share of the raised points that each explains, ``[N, K]``, less where they
-            are few.
+            ``[N, K]``: share of the raised points, less where they are few.
         """
         count = self.field.count
         scan = self._scan(depth, proprioception, estimate, expected, (RAISED // 2, GROUND // 2))
-        several = _Scan(*(part.repeat_interleave(count, 0) for part in scan))
-        fit = self._fit(several, torch.arange(count, device=depth.device).repeat(len(depth)), several.start)
-        share = fit.explained / fit.there.clamp(min=1)
-        match = self._match(several, fit, (fit.there >= FEW) & (share > MOST))
-        certain = (fit.there / MANY).clamp(max=1.0) * (fit.there >= FEW)
-        return match.unflatten(0, (-1, count)), (certain * share).unflatten(0, (-1, count))
+        several = _repeated(scan, count)
+        kinds = torch.arange(count, device=depth.device).repeat_interleave(len(depth))
+        fit = self._fit(several, kinds, several.start)
+        enough = (fit.there / MANY).clamp(max=1.0) * (fit.there >= FEW)
+        return (enough * fit.explained / fit.there.clamp(min=1)).unflatten(0, (count, -1)).mT
 
     def _scan(
         self,
@@ -242,13 +239,10 @@ class ScanMatcher(nn.Module):
         raised = here[..., 2] > ABOVE
         return _Fit(found, covariance, (weight * raised).sum(-1), (valid & covered & raised).sum(-1))
 
-    def _match(self, scan: _Scan, fit: _Fit, counts: Tensor) -> Tensor:
-        """What a fit says, ``[N, 7]``, of those that count and are not too far off."""
-        pose = torch.cat((fit.found[:, :2], fit.found[:, 2:3].sin(), fit.found[:, 2:3].cos()), -1)
-        seen = inverted(moved(pose, scan.motion))
-        near = torch.linalg.vector_norm((fit.found - scan.start)[:, :2], dim=-1) < FAR
-        variance = self.held * _seen_variance(fit.covariance[:, :3, :3], pose, seen) + self.floor.square()
-        return torch.cat((seen, torch.where((counts & near)[:, None], variance, NOTHING)), -1)
+
+def _repeated(scan: _Scan, count: int) -> _Scan:
+    """Scans ``[N, ...]`` one after another as often as that: ``[S N, ...]``."""
+    return _Scan(*(part.repeat(count, *(1,) * (part.dim() - 1)) for part in scan))
 
 
 def _best(fits: _Fit) -> _Fit:
