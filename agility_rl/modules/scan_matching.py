@@ -55,6 +55,12 @@ NOTHING = 1e6
 """Variance of what says nothing."""
 FEW, MANY = 12, 60
 """With fewer raised points there nothing is said of its type; more than that say no more."""
+_CROSS = (
+    ((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+    ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
+    ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+)
+"""What the cross products with the axes of roll, pitch and yaw do."""
 
 
 class _Scan(NamedTuple):
@@ -184,7 +190,7 @@ class ScanMatcher(nn.Module):
         count = self.field.count
         scan = self._scan(depth, proprioception, estimate, expected, (RAISED // 2, GROUND // 2))
         several = _repeated(scan, count)
-        kinds = torch.arange(count, device=depth.device).repeat_interleave(len(depth))
+        kinds = torch.arange(count, device=depth.device)[:, None].expand(-1, depth.shape[0]).flatten()
         fit = self._fit(several, kinds, several.start)
         enough = (fit.there / MANY).clamp(max=1.0) * (fit.there >= FEW)
         return (enough * fit.explained / fit.there.clamp(min=1)).unflatten(0, (count, -1)).mT
@@ -248,42 +254,36 @@ def _repeated(scan: _Scan, count: int) -> _Scan:
 def _best(fits: _Fit) -> _Fit:
     """Of several fits ``[S, N, ...]`` the first one, or the one that explains clearly more: ``[N, ...]``."""
     more = (fits.explained[1:] - BETTER[1]) / BETTER[0]
-    best = torch.cat((fits.explained[:1], more)).argmax(0)
-    rows = torch.arange(len(best), device=best.device)
-    return _Fit(*(part[best, rows] for part in fits))
+    best = torch.cat((fits.explained[:1], more)).argmax(0, keepdim=True)
+    return _Fit(*(part.take_along_dim(best.view(*best.shape, *(1,) * (part.dim() - 2)), 0)[0] for part in fits))
 
 
 def _placed(pose: Tensor, points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Points of the trunk's frame at the obstacle, ``[N, P, 3]``, and how they move with the pose, ``[N, P, 7, 3]``."""
-    x, y, yaw, height, pitch, roll, off = (value[:, None] for value in pose.unbind(-1))
-    (sine_r, cosine_r), (sine_p, cosine_p), (sine_y, cosine_y) = ((a.sin(), a.cos()) for a in (roll, pitch, yaw))
+    """Points of the trunk's frame at the obstacle, ``[N, P, 3]``, and how they move with the pose, ``[N, P, 7, 3]``.
 
-    def rolled(v: Tensor) -> Tensor:
-        a, b, c = v.unbind(-1)
-        return torch.stack((a, cosine_r * b - sine_r * c, sine_r * b + cosine_r * c), -1)
-
-    def pitched(v: Tensor) -> Tensor:
-        a, b, c = v.unbind(-1)
-        return torch.stack((cosine_p * a + sine_p * c, b, cosine_p * c - sine_p * a), -1)
-
-    def turned(v: Tensor) -> Tensor:
-        a, b, c = v.unbind(-1)
-        return torch.stack((cosine_y * a - sine_y * b, sine_y * a + cosine_y * b, c), -1)
-
-    leaning = rolled(points + off[..., None] * rays)
-    upright = pitched(leaning)
-    ahead = turned(upright)
-    zero, one = torch.zeros_like(ahead[..., 0]), torch.ones_like(ahead[..., 0])
+    Turned about axis k by an angle, with K what k x does: R = I + sin K + (1 - cos) K^2, whose slope is K R. Few
+    operations matter here more than few multiplications: a robot alone waits for Python.
+    """
+    angles = pose[:, [5, 4, 2], None, None]
+    cross = pose.new_tensor(_CROSS)
+    square, unit = cross @ cross, torch.eye(3, dtype=pose.dtype, device=pose.device)
+    roll, pitch, yaw = (unit + angles.sin() * cross + (1.0 - angles.cos()) * square).unbind(1)
+    about_roll, about_pitch, about_yaw = cross
+    level = yaw @ pitch
+    leaning = points + pose[:, 6, None, None] * rays
+    rolled = leaning @ roll.mT
+    ahead = rolled @ level.mT
+    shifts = unit.expand(*ahead.shape, 3).unbind(-2)
     moves = (
-        torch.stack((one, zero, zero), -1),
-        torch.stack((zero, one, zero), -1),
-        torch.stack((-ahead[..., 1], ahead[..., 0], zero), -1),
-        torch.stack((zero, zero, one), -1),
-        turned(torch.stack((upright[..., 2], zero, -upright[..., 0]), -1)),
-        turned(pitched(torch.stack((zero, -leaning[..., 2], leaning[..., 1]), -1))),
-        turned(pitched(rolled(rays))),
+        shifts[0],
+        shifts[1],
+        ahead @ about_yaw.mT,
+        shifts[2],
+        rolled @ (yaw @ about_pitch @ pitch).mT,
+        rolled @ (level @ about_roll).mT,
+        rays @ (level @ roll).mT,
     )
-    return ahead + torch.stack((x, y, height), -1), torch.stack(moves, -2)
+    return ahead + pose[:, None, [0, 1, 3]], torch.stack(moves, -2)
 
 
 def _seen_variance(covariance: Tensor, robot: Tensor, seen: Tensor) -> Tensor:
@@ -296,12 +296,23 @@ def _seen_variance(covariance: Tensor, robot: Tensor, seen: Tensor) -> Tensor:
 
 
 def inverted_spd(matrix: Tensor) -> Tensor:
-    """Inverse of small symmetric positive definite matrices ``[*B, n, n]``, in operations that ONNX has too.
+    """Inverse of small symmetric positive definite matrices ``[*B, n, n]``; exported, in operations that ONNX has too.
 
     Source: sweep operator (Beaton 1964; Goodnight 1979, doi:10.1080/00031305.1979.10482685).
 
     Example:
         >>> inverted_spd(torch.tensor([[2.0, 1.0], [1.0, 3.0]]))
+        tensor([[ 0.6000, -0.2000],
+                [-0.2000,  0.4000]])
+    """
+    return swept(matrix) if torch.compiler.is_exporting() else torch.linalg.inv_ex(matrix).inverse
+
+
+def swept(matrix: Tensor) -> Tensor:
+    """The same by sweeps.
+
+    Example:
+        >>> swept(torch.tensor([[2.0, 1.0], [1.0, 3.0]]))
         tensor([[ 0.6000, -0.2000],
                 [-0.2000,  0.4000]])
     """

@@ -13,7 +13,7 @@ from agility_rl.envs.course_presets import COURSES
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import camera, features
 from agility_rl.modules.planar import inverted
-from agility_rl.modules.scan_matching import FLOOR, NOTHING, ScanMatcher, _placed, _seen_variance, inverted_spd
+from agility_rl.modules.scan_matching import FLOOR, NOTHING, ScanMatcher, _placed, _seen_variance, inverted_spd, swept
 
 ROBOTS = 24
 SOLIDS = [kind.solids() for kind in OBSTACLES.values()]
@@ -169,7 +169,8 @@ def test_who_is_unsure_of_the_yaw_is_unsure_of_what_is_far() -> None:
 def test_inverse_of_badly_scaled_matrices() -> None:
     factor = torch.randn(20, 7, 9, generator=torch.Generator().manual_seed(0))
     matrix = factor @ factor.mT + torch.diag(torch.tensor([4.0, 4.0, 25.0, 400.0, 400.0, 4444.0, 1189.0]))
-    torch.testing.assert_close(inverted_spd(matrix) @ matrix, torch.eye(7).expand(20, 7, 7), atol=1e-5, rtol=0.0)
+    for inverse in (inverted_spd(matrix), swept(matrix)):
+        torch.testing.assert_close(inverse @ matrix, torch.eye(7).expand(20, 7, 7), atol=1e-5, rtol=0.0)
 
 
 @pytest.mark.parametrize("name", TAUGHT)
