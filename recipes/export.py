@@ -1,13 +1,11 @@
-"""Make a controller or a student ready for a robot: a complete manifest, ONNX beside the weights, and proof that they
-agree.
+"""Make a controller or a student ready for a robot: a complete manifest, ONNX and weights, and proof that they agree.
 
 It is driven in the training environment (a controller in all five behaviours, a student over its course), what it saw
 is put through the training's own policy, the network of ``agility_rl.deploy`` by PyTorch, and the ONNX file by
 onnxruntime. Nothing is written unless they agree. An artifact of an earlier format becomes one of the present.
 
 In:  a run or artifact folder of a BBC or of a student.
-Out: ``--output`` (the same artifact folder by default) with ``manifest.json``, ``weights-*.safetensors``,
-     ``policy-*.onnx``; the ONNX file carries the manifest as metadata.
+Out: ``--output`` (by default the same folder): ``manifest.json``, weights, ``policy-*.onnx`` with the manifest in it.
 
     python recipes/export.py runs/my_run [--output exported/my_bbc]
     python recipes/export.py runs/my_student --bbc pretrained/bbc_leaping
@@ -21,6 +19,7 @@ import hashlib
 import io
 import json
 import logging
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
@@ -106,6 +105,11 @@ class Exportable:
         """Number of recorded inputs."""
         return len(self.seen[0])
 
+    @property
+    def strays(self) -> int:
+        """Of them answers to these may differ more: a shape that fits in two places goes to either by rounding."""
+        return 0 if self.allowed == SAME_ANSWER else self.size // 100
+
 
 def recorded_inputs(controller: Controller, steps: int, seed: int) -> TensorDict:
     """What the controller saw, ``[steps x 5]``, in roll-outs from standing, each behaviour in mid-range (Table S2)."""
@@ -189,10 +193,11 @@ def to_onnx(export: Exportable, metadata: dict[str, Any]) -> bytes:
     return model.SerializeToString(deterministic=True)
 
 
-def difference(ours: Sequence[Tensor], theirs: Sequence[Tensor]) -> float:
-    """Largest ``|a - b| / max(1, |b|)``; NaN counts as infinite."""
-    shares = [(a - b).abs() / b.abs().clamp(min=1.0) for a, b in zip(ours, theirs, strict=True)]
-    return max(float(share.nan_to_num(torch.inf).max()) for share in shares)
+def difference(ours: Sequence[Tensor], theirs: Sequence[Tensor], strays: int = 0) -> float:
+    """Largest ``|a - b| / max(1, |b|)``, but for so many rows; NaN counts as infinite anywhere."""
+    shares = [((a - b).abs() / b.abs().clamp(min=1.0)).flatten(1) for a, b in zip(ours, theirs, strict=True)]
+    worst = torch.cat(shares, -1).amax(-1).sort().values
+    return math.inf if worst.isnan().any() else float(worst[-1 - strays])
 
 
 @torch.no_grad()
@@ -207,7 +212,7 @@ def check_network(export: Exportable) -> tuple[Tensor, ...]:
         for inputs in ([values.split(size) for values in export.seen] for size in (1, BATCH))
     )
     for answers, allowed in ((batches, SAME_ANSWER), (rows, export.allowed)):
-        worst = difference(answers, export.expected)
+        worst = difference(answers, export.expected, export.strays)
         if not worst <= allowed:
             raise ArtifactError(
                 f"{export.artifact.folder}: the network for deployment differs from the training policy by "
@@ -224,7 +229,7 @@ def check_onnx(export: Exportable, artifact: Artifact, answers: Sequence[Tensor]
     """
     run, size = export.by_onnx(artifact), export.size
     rows = [run(*(values[index : index + 1] for values in export.seen)) for index in range(size)]
-    worst = difference([torch.cat(column) for column in zip(*rows, strict=True)], answers)
+    worst = difference([torch.cat(column) for column in zip(*rows, strict=True)], answers, export.strays)
     if not worst <= export.allowed:
         raise ArtifactError(
             f"{artifact.folder}: onnxruntime and PyTorch differ by {worst:.2e} on {size} recorded inputs, "
@@ -247,20 +252,20 @@ def main(cfg: Config) -> Path:
     if cfg.steps < 1:
         raise ValueError(f"expected --steps of at least 1, got {cfg.steps}")
     torch.set_num_threads(1)  # a few robots: threads would only wait for each other
-    export = student_to_export(cfg) if kind_of(cfg.run) == "student" else controller_to_export(cfg)
+    of_student = cfg.run.is_dir() and Artifact.load(cfg.run).manifest["kind"] == "student"
+    export = student_to_export(cfg) if of_student else controller_to_export(cfg)
     source = export.artifact
-    output = source.folder if cfg.output is None else cfg.output
+    output = cfg.output or source.folder
     manifest, answers = complete_manifest(export), check_network(export)
     weights = source.manifest["weights"]["sha256"]
     content = to_onnx(export, {**manifest, "weights_sha256": weights})
-    digest = hashlib.sha256(content).hexdigest()
     entry = {
-        "file": f"policy-{digest[:16]}.onnx",
+        "file": f"policy-{(digest := hashlib.sha256(content).hexdigest())[:16]}.onnx",
         "sha256": digest,
         "weights_sha256": weights,
         "inputs": {name: list(value.shape) for name, value in zip(export.inputs, export.example, strict=True)},
         "outputs": list(export.outputs),
-        "checked_on": f"{export.size} recorded inputs",
+        "checked_on": f"{export.size} recorded inputs" + f", but for the {export.strays} worst" * bool(export.strays),
     }
     output.mkdir(parents=True, exist_ok=True)
     onnx_file = output / entry["file"]
@@ -283,16 +288,11 @@ def main(cfg: Config) -> Path:
     if artifact.manifest["weights"]["sha256"] != weights:
         raise ArtifactError(f"{output}: the weights changed while they were written; export again")
     print(
-        f"{output}: {export.what} checked on {export.size} recorded inputs; PyTorch and onnxruntime differ by "
+        f"{output}: {export.what} checked on {entry['checked_on']}; PyTorch and onnxruntime differ by "
         f"{entry['largest_difference']:.1e} at most (allowed {export.allowed:.0e})\n"
         f"{onnx_file.name}: {len(content) / 1e6:.2f} MB"
     )
     return output
-
-
-def kind_of(run: Path) -> str:
-    """What a folder holds; a folder that is none is for others to refuse."""
-    return str(Artifact.load(run).manifest["kind"]) if run.is_dir() else "bbc"
 
 
 if __name__ == "__main__":
