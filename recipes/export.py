@@ -107,7 +107,7 @@ class Exportable:
 
     @property
     def strays(self) -> int:
-        """Of them answers to these may differ more: a shape that fits in two places goes to either by rounding."""
+        """How many of their answers may differ more: a shape that fits in two places goes to either by rounding."""
         return 0 if self.allowed == SAME_ANSWER else self.size // 100
 
 
@@ -254,13 +254,13 @@ def main(cfg: Config) -> Path:
     torch.set_num_threads(1)  # a few robots: threads would only wait for each other
     of_student = cfg.run.is_dir() and Artifact.load(cfg.run).manifest["kind"] == "student"
     export = student_to_export(cfg) if of_student else controller_to_export(cfg)
-    source = export.artifact
-    output = cfg.output or source.folder
+    source, output = export.artifact, cfg.output or export.artifact.folder
     manifest, answers = complete_manifest(export), check_network(export)
     weights = source.manifest["weights"]["sha256"]
     content = to_onnx(export, {**manifest, "weights_sha256": weights})
+    digest = hashlib.sha256(content).hexdigest()
     entry = {
-        "file": f"policy-{(digest := hashlib.sha256(content).hexdigest())[:16]}.onnx",
+        "file": f"policy-{digest[:16]}.onnx",
         "sha256": digest,
         "weights_sha256": weights,
         "inputs": {name: list(value.shape) for name, value in zip(export.inputs, export.example, strict=True)},

@@ -40,9 +40,9 @@ class Misjudgement:
 
     p and :math:`\psi` are the robot's place and yaw in its obstacle's frame, o is where it sees the obstacle. Until it
     has been in view, the obstacle stands for the robot u away from where it does, and is of no type unless that could
-    be guessed; afterwards it is seen e beside where it is. The deviations of e are multiplied by a factor that is
-    drawn for each obstacle (:data:`SPREAD`): who holds one post for another does so until he is through. All sizes
-    are multiplied by the factor. All else that is said of the place follows from there, and the terrain is what lies
+    be guessed; afterwards it is seen e beside where it is. The deviations of e are scaled anew for each obstacle
+    (:data:`SPREAD`): who holds one post for another does so until he is through. All sizes are multiplied by the
+    factor besides. All else that is said of the place follows from there, and the terrain is what lies
     around there. The obstacle after it is unseen, too.
 
     Source: ours; the sizes are those of a student that matches shapes (docs/student.md). A teacher that learns with
@@ -56,7 +56,7 @@ class Misjudgement:
 
     Attributes:
         seen: ``[N, 3]``, e in units of its deviations.
-        scale: ``[N]``, factor on those.
+        scale: ``[N]``, by which those are scaled for the present obstacle.
         unseen: ``[N, 3]``, u in units of its deviations.
         upcoming: ``[N, 3]``, that of the obstacle after this one.
         kept: a, the share of e that is left after a decision.

@@ -309,7 +309,9 @@ def inverted_spd(matrix: Tensor) -> Tensor:
 
 
 def swept(matrix: Tensor) -> Tensor:
-    """The same by sweeps.
+    """The same of ``[*B, n, n]``, by sweeps over its columns.
+
+    Source: as :func:`inverted_spd`.
 
     Example:
         >>> swept(torch.tensor([[2.0, 1.0], [1.0, 3.0]]))
