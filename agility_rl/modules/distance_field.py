@@ -114,6 +114,9 @@ class DistanceField(nn.Module):
     Args:
         types: the solids of every type of obstacle, ``[K][...]``.
 
+    Attributes:
+        count: K.
+
     Raises:
         ValueError: if there is no such kind of solid.
 

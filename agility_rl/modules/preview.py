@@ -63,7 +63,7 @@ class Preview(nn.Module):
     Example:
         >>> preview = Preview(7)
         >>> memory, place = torch.zeros(2, preview.size), torch.tensor([[-2.5, 0.0, 0.0, 1.0], [9.0, 0.0, 0.0, 1.0]])
-        >>> torch.equal(preview.place(memory, place), place), preview.in_view(place)
+        >>> torch.equal(preview.place(memory, place), place), preview.in_view(inverted(place))
         (True, tensor([ True, False]))
     """
 
@@ -93,14 +93,13 @@ class Preview(nn.Module):
         return composed(inverted(memory[..., :NUM_POSE] + self.start), at_slot)
 
     def variance(self, memory: Tensor) -> Tensor:
-        """Of where the next obstacle stands, ``[*B, 3]``."""
+        """Of where the next obstacle stands, ``[*B, 3]``: x, y [m^2], yaw [rad^2]."""
         return memory.split(self.parts, -1)[1] + self.jitter
 
-    def in_view(self, place: Tensor) -> Tensor:
-        """Whether obstacles may be within the image, bool ``[*B]``, for robots at ``[*B, 4]`` in their frames."""
-        seen = inverted(place)[..., :2]
+    def in_view(self, seen: Tensor) -> Tensor:
+        """Whether obstacles at ``[*B, 4]`` in the robots' frames may be within the image, bool ``[*B]``."""
         bearing = torch.atan2(seen[..., 1], seen[..., 0])
-        return (torch.linalg.vector_norm(seen, dim=-1) < VIEW_DISTANCE) & (bearing.abs() < VIEW_ANGLE)
+        return (torch.linalg.vector_norm(seen[..., :2], dim=-1) < VIEW_DISTANCE) & (bearing.abs() < VIEW_ANGLE)
 
     def arrived(self, memory: Tensor, onwards: Tensor) -> Tensor:
         """Memory ``[*B, M]`` when another obstacle has become the present one; bool ``[*B, 1]``: the next one has."""
@@ -109,7 +108,7 @@ class Preview(nn.Module):
         return torch.cat((empty, coming * onwards), -1)
 
     def silence(self, memory: Tensor, at_slot: Tensor) -> Tensor:
-        """What images say that show nothing of it, ``[*B, 7 + K]``."""
+        """What images say that show nothing of it, ``[*B, 7 + K]``: that it is where it was expected, of any type."""
         expected, hints = inverted(self.place(memory, at_slot)), self.hints(memory)[0]
         nothing = torch.full_like(expected[..., :NUM_SCALES], NOTHING)
         return torch.cat((expected, nothing, torch.zeros_like(hints)), -1)
@@ -137,11 +136,12 @@ class Preview(nn.Module):
             at_slot: the robot's place at the next slot, ``[N, 4]``.
         """
         silence = self.silence(memory, at_slot)
-        visible = is_next & self.in_view(self.place(memory, at_slot))
+        expected = silence[:, :NUM_POSE]
+        visible = is_next & self.in_view(expected)
         # An exported network cannot choose rows; elsewhere most are spared K fits.
         every = torch.arange(len(visible), device=visible.device)
         rows = every if torch.compiler.is_exporting() else every[visible]
-        measured = [part[rows] for part in (depth, proprioception, estimate, silence[:, :NUM_POSE])]
+        measured = [part[rows] for part in (depth, proprioception, estimate, expected)]
         evidence = EVIDENCE * matcher.compare(*measured)
         match = matcher(*measured, (self.hints(memory)[0][rows] + evidence).argmax(-1))
         said = silence.index_copy(0, rows, torch.cat((match, evidence), -1))

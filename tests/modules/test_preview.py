@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from agility_rl.go2 import camera
-from agility_rl.modules.planar import inverted
 from agility_rl.modules.preview import ALIKE, EVIDENCE, NEXT, STRONGEST, VIEW_ANGLE, VIEW_DISTANCE, Preview
 from agility_rl.modules.scan_matching import FLOOR, NOTHING, ScanMatcher
 
@@ -90,7 +89,7 @@ def test_rows_do_not_mix() -> None:
 )
 def test_the_bounds_of_what_is_in_view(distance: float, angle: float, there: bool) -> None:
     seen = torch.tensor([distance * math.cos(angle), distance * math.sin(angle), 0.6, 0.8])
-    assert bool(Preview(2).in_view(inverted(seen))) == there
+    assert bool(Preview(2).in_view(seen)) == there
 
 
 def test_a_place_is_that_at_the_obstacle() -> None:
