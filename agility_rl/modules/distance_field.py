@@ -160,7 +160,7 @@ class DistanceField(nn.Module):
         corner = torch.minimum(cells.clamp(min=0.0), self.last - 1e-3).long()
         share = cells - corner
         first = kind[:, None] * self.size + (corner * self.strides).sum(-1)
-        at = self.values[first[..., None] + self.corners].unflatten(-1, (2, 2, 2))
+        at = self.values[first[..., None] + self.corners].to(points.dtype).unflatten(-1, (2, 2, 2))
         along_z, along_y, along_x = share[..., None, None, 2], share[..., None, 1], share[..., 0]
         on_z = torch.lerp(at[..., 0], at[..., 1], along_z)
         on_y = torch.lerp(on_z[..., 0], on_z[..., 1], along_y)

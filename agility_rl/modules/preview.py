@@ -142,8 +142,10 @@ class Preview(nn.Module):
         every = torch.arange(len(visible), device=visible.device)
         rows = every if torch.compiler.is_exporting() else every[visible]
         measured = [part[rows] for part in (depth, proprioception, estimate, expected)]
-        evidence = EVIDENCE * matcher.compare(*measured)
-        match = matcher(*measured, (self.hints(memory)[0][rows] + evidence).argmax(-1))
+        matches, share = matcher.compare(*measured)
+        evidence = EVIDENCE * share
+        likeliest = (self.hints(memory)[0][rows] + evidence).argmax(-1)
+        match = matches.take_along_dim(likeliest[:, None, None], 1)[:, 0]
         said = silence.index_copy(0, rows, torch.cat((match, evidence), -1))
         return torch.where(visible[:, None], said, silence)
 

@@ -23,6 +23,8 @@ NEAREST, FARTHEST = 0.5, 3.9
 """Depths that count [m]: what is nearer may be the robot's own leg, what is farther nothing."""
 RAISED, GROUND = 192, 64
 """So many points above the ground, and on it, are matched."""
+COMPARED = 64
+"""So many above it where every type is tried."""
 ABOVE, BELOW = 0.06, 1.6
 """Heights above the ground of the former [m]."""
 AROUND = (2.3, 1.1)
@@ -34,10 +36,14 @@ WIDTH = (0.1, 0.04)
 """Distance to the surface at which a point counts for a quarter [m]: in the first step, in the last."""
 DEVIATION = 0.05
 """Of a point's distance from the surface [m]; larger than that of a pixel, since neighbours err alike."""
-EXPECTED = (0.5, 0.5, 0.2, 0.05, 0.05, 0.015, 0.029)
-"""Deviations of what is expected: x, y [m] and yaw [rad] of the robot at the obstacle, its height [m], pitch with that
-of the camera, and roll [rad], and what all depths of an image are off by [m] (uniform within 0.05, and the mounting
-angle within 5 degrees: method notes, section 5.8)."""
+EXPECTED = (0.5, 0.5, 0.05, 0.2, 0.05, 0.015, 0.029)
+"""Deviations of what is expected: x, y of the robot at the obstacle and its height [m], its yaw, pitch with that of the
+camera, and roll [rad], and what all depths of an image are off by [m] (uniform within 0.05, and the mounting angle
+within 5 degrees: method notes, section 5.8)."""
+PLANAR = [0, 1, 3]
+"""x, y and yaw of these."""
+GRID = 2.0**-7
+"""Matching begins at multiples of this [m, rad]; see :func:`on_grid`."""
 LEAST, SHARE, FAR = 15, 0.3, 0.8
 """A match counts if it explains so many of the raised points, such a share of them, and lies less than so far [m] from
 where it was expected."""
@@ -56,11 +62,11 @@ NOTHING = 1e6
 FEW, MANY = 12, 60
 """With fewer raised points there nothing is said of its type; more than that say no more."""
 _CROSS = (
-    ((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
-    ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
     ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
+    ((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
 )
-"""What the cross products with the axes of roll, pitch and yaw do."""
+"""What the cross products with the axes of yaw, pitch and roll do."""
 
 
 class _Scan(NamedTuple):
@@ -129,12 +135,14 @@ class ScanMatcher(nn.Module):
     held: Tensor
     around: Tensor
     aside: Tensor
+    turns: Tensor
 
     def __init__(self, types: Sequence[Sequence[Solid]]) -> None:
         super().__init__()
         self.field = DistanceField(types)
         rays = camera.pixel_directions()[::STRIDE, ::STRIDE].flatten(0, 1)
         shuffled = torch.rand(len(rays), generator=torch.Generator().manual_seed(0))
+        cross = torch.tensor(_CROSS, dtype=torch.float64)
         for name, value in {
             "rays": rays,
             "mount": torch.tensor(camera.POSITION),
@@ -144,6 +152,7 @@ class ScanMatcher(nn.Module):
             "held": torch.tensor(HELD),
             "around": torch.tensor(AROUND),
             "aside": ASIDE * torch.tensor([0.0, 1.0, -1.0])[:, None, None] * torch.eye(len(EXPECTED))[1],
+            "turns": torch.stack((torch.eye(3).double().expand(3, -1, -1), cross, cross @ cross)),
         }.items():
             self.register_buffer(name, value, persistent=False)
 
@@ -164,19 +173,13 @@ class ScanMatcher(nn.Module):
             ``[N, 7]``: as ``expected``, and variances of x, y [m^2] and yaw [rad^2], :data:`NOTHING` without a match.
         """
         scan = self._scan(depth, proprioception, estimate, expected, (RAISED, GROUND))
-        count = len(self.aside)
-        fits = self._fit(_repeated(scan, count), kind.repeat(count), (scan.start + self.aside).flatten(0, 1))
-        fit = _best(_Fit(*(part.unflatten(0, (count, -1)) for part in fits)))
-        pose = torch.cat((fit.found[:, :2], fit.found[:, 2:3].sin(), fit.found[:, 2:3].cos()), -1)
-        seen = inverted(moved(pose, scan.motion))
-        near = torch.linalg.vector_norm((fit.found - scan.start)[:, :2], dim=-1) < FAR
-        counts = (fit.explained > LEAST) & (fit.explained > SHARE * fit.there) & near
-        variance = self.held * _seen_variance(fit.covariance[:, :3, :3], pose, seen) + self.floor.square()
-        return torch.cat((seen, torch.where(counts[:, None], variance, NOTHING)), -1)
+        return self._matches(scan, kind)[0]
 
     @torch.no_grad()
-    def compare(self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor) -> Tensor:
-        """How much of what stands where an obstacle is expected is explained if that is of each type.
+    def compare(
+        self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Where an obstacle is seen if it is of each type, and how much of what stands there that explains.
 
         Args:
             depth: as :meth:`forward`, as are the next three.
@@ -185,15 +188,28 @@ class ScanMatcher(nn.Module):
             expected: ``[N, 4]``.
 
         Returns:
-            ``[N, K]``: share of the raised points, less where they are few.
+            Matches ``[N, K, 7]``, as :meth:`forward`; share of the raised points, less where they are few, ``[N, K]``.
         """
         count = self.field.count
-        scan = self._scan(depth, proprioception, estimate, expected, (RAISED // 2, GROUND // 2))
-        several = _repeated(scan, count)
-        kinds = torch.arange(count, device=depth.device)[:, None].expand(-1, depth.shape[0]).flatten()
-        fit = self._fit(several, kinds, several.start)
+        scan = self._scan(depth, proprioception, estimate, expected, (COMPARED, GROUND))
+        kinds = torch.arange(count, device=depth.device).repeat_interleave(len(depth))
+        matches, fit = self._matches(_repeated(scan, count), kinds)
         enough = (fit.there / MANY).clamp(max=1.0) * (fit.there >= FEW)
-        return (enough * fit.explained / fit.there.clamp(min=1)).unflatten(0, (count, -1)).mT
+        share = enough * fit.explained / fit.there.clamp(min=1)
+        return matches.unflatten(0, (count, -1)).transpose(0, 1), share.unflatten(0, (count, -1)).mT
+
+    def _matches(self, scan: _Scan, kind: Tensor) -> tuple[Tensor, _Fit]:
+        """Where obstacles of types int64 ``[N]`` are seen, ``[N, 7]``, and how they fit."""
+        count = len(self.aside)
+        fits = self._fit(_repeated(scan, count), kind.repeat(count), (scan.start + self.aside).flatten(0, 1))
+        fit = _best(_Fit(*(part.unflatten(0, (count, -1)) for part in fits)))
+        x, y, yaw = fit.found[:, PLANAR].unbind(-1)
+        pose = torch.stack((x, y, yaw.sin(), yaw.cos()), -1)
+        seen = inverted(moved(pose, scan.motion))
+        near = torch.linalg.vector_norm((fit.found - scan.start)[:, :2], dim=-1) < FAR
+        counts = (fit.explained > LEAST) & (fit.explained > SHARE * fit.there) & near
+        variance = self.held * _seen_variance(fit.covariance[:, PLANAR][..., PLANAR], pose, seen) + self.floor.square()
+        return torch.cat((seen, torch.where(counts[:, None], variance, NOTHING)), -1), fit
 
     def _scan(
         self,
@@ -204,12 +220,13 @@ class ScanMatcher(nn.Module):
         most: tuple[int, int],
     ) -> _Scan:
         """At most so many points above the ground and on it, about where the obstacle is expected."""
+        expected = on_grid(expected)
         motion = LATENCY * planar_motion(proprioception, estimate)
         roll_pitch, rates = attitude(proprioception)
         roll, pitch = (roll_pitch - LATENCY * rates[..., :2]).unbind(-1)
         robot = moved(inverted(expected), -motion)
         height, yaw = estimate[:, 0], torch.atan2(robot[:, 2], robot[:, 3])
-        start = torch.stack((robot[:, 0], robot[:, 1], yaw, height, pitch, roll, torch.zeros_like(roll)), -1)
+        start = torch.stack((robot[:, 0], robot[:, 1], height, yaw, pitch, roll, torch.zeros_like(roll)), -1)
         metres = camera.metres(depth[..., ::STRIDE, ::STRIDE]).flatten(1)
         points = metres[..., None] * self.rays + self.mount
         up = torch.stack((-pitch.sin(), pitch.cos() * roll.sin(), pitch.cos() * roll.cos()), -1)
@@ -228,22 +245,39 @@ class ScanMatcher(nn.Module):
 
     def _fit(self, scan: _Scan, kind: Tensor, found: Tensor) -> _Fit:
         """Gauss-Newton from poses ``[N, 7]`` at obstacles of types int64 ``[N]``."""
-        start, _, points, rays, valid = scan
-        unsure = self.expected.square()
-        known = torch.diag(unsure.reciprocal())
+        valid = scan.valid
+        # So few points, with a type that they are not of, may fit in two places: by doubles always in the same one.
+        start, found, points, rays = (part.double() for part in (scan.start, found, scan.points, scan.rays))
+        stiff = (DEVIATION / self.expected.double()).square()
         for step in range(STEPS):
             width = WIDTH[0] * (WIDTH[1] / WIDTH[0]) ** (step / (STEPS - 1))
-            here, jacobian = _placed(found, points, rays)
+            turn, axes = _turned(found, self.turns)
+            ahead = (points + found[:, 6, None, None] * rays) @ turn.mT
+            here = ahead + found[:, None, :3]
             distance, gradient, covered = self.field(kind, here)
             weight = (1.0 + (distance / width).square()).reciprocal().square() * (valid & covered)
-            slope = (jacobian * gradient[..., None, :]).sum(-1)
-            normal = (slope * weight[..., None]).mT @ slope / DEVIATION**2 + known
-            residual = (slope * (weight * distance)[..., None]).sum(-2) / DEVIATION**2
-            covariance = inverted_spd(normal)
-            pull = residual + (found - start) / unsure
-            found = found - (covariance @ pull[..., None])[..., 0]
+            nearer = (rays * (gradient @ turn)).sum(-1, keepdim=True)
+            slope = torch.cat((gradient, torch.linalg.cross(ahead, gradient) @ axes, nearer), -1)
+            weighted = (slope * weight[..., None]).mT
+            pull = (weighted @ distance[..., None])[..., 0] + stiff * (found - start)
+            inverse = inverted_spd(weighted @ slope + torch.diag(stiff))
+            found = found - (inverse @ pull[..., None])[..., 0]
         raised = here[..., 2] > ABOVE
-        return _Fit(found, covariance, (weight * raised).sum(-1), (valid & covered & raised).sum(-1))
+        explained, there = (weight * raised).sum(-1), (valid & covered & raised).sum(-1)
+        return _Fit(found.float(), (DEVIATION**2 * inverse).float(), explained.float(), there)
+
+
+def on_grid(place: Tensor) -> Tensor:
+    """Places ``[*B, 4]`` (x, y, sine and cosine of the yaw) to 8 mm and 8 mrad: rounding alone no longer tells them
+    apart, and a shape that fits in two places is always found in the same one.
+
+    Example:
+        >>> on_grid(torch.tensor([1.0001, -0.4999, 0.0001, 1.0]))
+        tensor([ 1.0000, -0.5000,  0.0000,  1.0000])
+    """
+    yaw = torch.atan2(place[..., 2], place[..., 3])
+    x, y, yaw = ((part / GRID).round() * GRID for part in (place[..., 0], place[..., 1], yaw))
+    return torch.stack((x, y, yaw.sin(), yaw.cos()), -1)
 
 
 def _repeated(scan: _Scan, count: int) -> _Scan:
@@ -258,32 +292,17 @@ def _best(fits: _Fit) -> _Fit:
     return _Fit(*(part.take_along_dim(best.view(*best.shape, *(1,) * (part.dim() - 2)), 0)[0] for part in fits))
 
 
-def _placed(pose: Tensor, points: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Points of the trunk's frame at the obstacle, ``[N, P, 3]``, and how they move with the pose, ``[N, P, 7, 3]``.
+def _turned(pose: Tensor, turns: Tensor) -> tuple[Tensor, Tensor]:
+    """What turns the trunk's frame into the obstacle's, ``[N, 3, 3]``, and the axes of yaw, pitch and roll there.
 
-    Turned about axis k by an angle, with K what k x does: R = I + sin K + (1 - cos) K^2, whose slope is K R. Few
-    operations matter here more than few multiplications: a robot alone waits for Python.
+    Turned about axis k by an angle, with K what k x does: R = I + sin K + (1 - cos) K^2. Few operations matter here
+    more than few multiplications: a robot alone waits for Python.
     """
-    angles = pose[:, [5, 4, 2], None, None]
-    cross = pose.new_tensor(_CROSS)
-    square, unit = cross @ cross, torch.eye(3, dtype=pose.dtype, device=pose.device)
-    roll, pitch, yaw = (unit + angles.sin() * cross + (1.0 - angles.cos()) * square).unbind(1)
-    about_roll, about_pitch, about_yaw = cross
+    angles = pose[:, 3:6, None, None]
+    unit, cross, square = turns
+    yaw, pitch, roll = (unit + angles.sin() * cross + (1.0 - angles.cos()) * square).unbind(1)
     level = yaw @ pitch
-    leaning = points + pose[:, 6, None, None] * rays
-    rolled = leaning @ roll.mT
-    ahead = rolled @ level.mT
-    shifts = unit.expand(*ahead.shape, 3).unbind(-2)
-    moves = (
-        shifts[0],
-        shifts[1],
-        ahead @ about_yaw.mT,
-        shifts[2],
-        rolled @ (yaw @ about_pitch @ pitch).mT,
-        rolled @ (level @ about_roll).mT,
-        rays @ (level @ roll).mT,
-    )
-    return ahead + pose[:, None, [0, 1, 3]], torch.stack(moves, -2)
+    return level @ roll, torch.stack((unit[0, 2].expand(len(pose), -1), yaw[..., 1], level[..., 0]), -1)
 
 
 def _seen_variance(covariance: Tensor, robot: Tensor, seen: Tensor) -> Tensor:

@@ -13,7 +13,16 @@ from agility_rl.envs.course_presets import COURSES
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import camera, features
 from agility_rl.modules.planar import inverted
-from agility_rl.modules.scan_matching import FLOOR, NOTHING, ScanMatcher, _placed, _seen_variance, inverted_spd, swept
+from agility_rl.modules.scan_matching import (
+    FLOOR,
+    NOTHING,
+    ScanMatcher,
+    _seen_variance,
+    _turned,
+    inverted_spd,
+    on_grid,
+    swept,
+)
 
 ROBOTS = 24
 SOLIDS = [kind.solids() for kind in OBSTACLES.values()]
@@ -79,18 +88,19 @@ def test_who_sees_nothing_is_told_nothing(matcher: ScanMatcher) -> None:
     (_, proprioception, estimate), seen, kind = standing("tunnel")
     estimate[:, 1] = 3.0 * features.LINEAR_VELOCITY_SCALE  # where it was expected, however fast the robot is
     far = torch.full((ROBOTS, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH), 0.5)
+    seen = on_grid(seen)
     match = matcher(far, proprioception, estimate, seen, kind)
     assert (match[:, 4:] == NOTHING).all()
     torch.testing.assert_close(match[:, :4], seen, atol=1e-4, rtol=0.0)
 
 
 def test_an_image_is_one_frame_old(matcher: ScanMatcher) -> None:
-    """In 0.02 s, 3 m/s forward are 0.06 m, by which all is nearer now, and 2 rad/s of roll or pitch are 0.04 rad."""
+    """In 0.02 s, 3.125 m/s forward are 0.0625 m, by which all is nearer now; 2 rad/s of roll or pitch are 0.04 rad."""
     (depth, proprioception, estimate), seen, kind = standing("tunnel")
-    expected = beside(seen)
+    expected = on_grid(beside(seen))
     still = matcher(depth, proprioception, estimate, expected, kind)
-    moving, nearer = estimate.clone(), torch.tensor([0.06, 0.0, 0.0, 0.0])
-    moving[:, 1] = 3.0 * features.LINEAR_VELOCITY_SCALE
+    moving, nearer = estimate.clone(), torch.tensor([0.0625, 0.0, 0.0, 0.0])
+    moving[:, 1] = 3.125 * features.LINEAR_VELOCITY_SCALE
     match = matcher(depth, proprioception, moving, expected - nearer, kind)
     torch.testing.assert_close(match[:, :4], still[:, :4] - nearer, atol=1e-4, rtol=0.0)
     for axis in (0, 1):
@@ -140,18 +150,26 @@ def test_rows_do_not_mix_and_stored_images_say_the_same(matcher: ScanMatcher) ->
     assert not matcher(depth.requires_grad_(), proprioception, estimate, expected, kind).requires_grad
 
 
-def test_points_are_placed_by_hand() -> None:
-    """Roll lifts what is to the left, pitch lowers what is ahead, yaw turns that to the left; then comes the shift."""
+def test_points_are_turned_by_hand(matcher: ScanMatcher) -> None:
+    """Roll lifts what is to the left, pitch lowers what is ahead, yaw turns that to the left."""
     sine, cosine = math.sin(0.1), math.cos(0.1)
     for angle, point, turned in (
         (5, (0.0, 1.0, 0.0), (0.0, cosine, sine)),
         (4, (1.0, 0.0, 0.0), (cosine, 0.0, -sine)),
-        (2, (1.0, 0.0, 0.0), (cosine, sine, 0.0)),
+        (3, (1.0, 0.0, 0.0), (cosine, sine, 0.0)),
     ):
-        pose = torch.tensor([[-2.0, 0.5, 0.0, 0.3, 0.0, 0.0, 0.0]])
+        pose = torch.zeros(1, 7, dtype=torch.float64)
         pose[0, angle] = 0.1
-        here, _ = _placed(pose, torch.tensor([[point]]), torch.zeros(1, 1, 3))
-        torch.testing.assert_close(here[0, 0], torch.tensor(turned) + torch.tensor([-2.0, 0.5, 0.3]))
+        torch.testing.assert_close(_turned(pose, matcher.turns)[0][0] @ pose.new_tensor(point), pose.new_tensor(turned))
+
+
+def test_axes_say_how_points_move_when_angles_change(matcher: ScanMatcher) -> None:
+    pose = torch.tensor([[-2.0, 0.5, 0.3, 0.7, -0.4, 0.2, 0.0]], dtype=torch.float64)
+    point = pose.new_tensor([0.3, -1.1, 0.6])
+    moves = torch.autograd.functional.jacobian(lambda pose: _turned(pose, matcher.turns)[0][0] @ point, pose)[:, 0, 3:6]
+    turn, axes = (part[0] for part in _turned(pose, matcher.turns))
+    torch.testing.assert_close(turn @ turn.mT, torch.eye(3).double())
+    torch.testing.assert_close(moves, torch.linalg.cross(axes, (turn @ point)[:, None].expand(3, 3), dim=0))
 
 
 def test_who_is_unsure_of_the_yaw_is_unsure_of_what_is_far() -> None:
@@ -173,20 +191,35 @@ def test_inverse_of_badly_scaled_matrices() -> None:
         torch.testing.assert_close(inverse @ matrix, torch.eye(7).expand(20, 7, 7), atol=1e-5, rtol=0.0)
 
 
+def test_what_only_rounding_tells_apart_is_matched_alike(matcher: ScanMatcher) -> None:
+    """Whether robots are matched alone or together; also where a shape fits in two places, and with any type."""
+    measured, seen, kind = standing("weave_poles", 1.0)
+    inputs = (*measured, on_grid(beside(seen)))
+    nearly = (*measured, inputs[-1] * (1.0 + 1e-6))
+    for each in (lambda *rows: matcher.compare(*rows[:-1])[0], matcher.forward):
+        together = each(*inputs, kind)
+        alone = torch.cat([each(*rows) for rows in zip(*(values.split(1) for values in (*nearly, kind)), strict=True)])
+        torch.testing.assert_close(alone, together, rtol=1e-6, atol=1e-6)
+
+
 @pytest.mark.parametrize("name", TAUGHT)
 def test_an_obstacle_is_told_from_others_by_its_shape(matcher: ScanMatcher, name: str) -> None:
     """Of most robots before it, with all errors of the camera."""
     measured, seen, kind = standing(name, 1.0)
-    share = matcher.compare(*measured, beside(seen))
+    expected = beside(seen)
+    matches, share = matcher.compare(*measured, expected)
     assert share.shape == (ROBOTS, len(SOLIDS)) and ((share >= 0.0) & (share <= 1.0)).all()
     assert (share.argmax(-1) == kind).float().mean() > 0.8
+    assert matches.shape == (ROBOTS, len(SOLIDS), 7)
+    off = errors(matches[range(ROBOTS), kind], matcher(*measured, expected, kind))
+    assert off.median() < 0.02, off
 
 
 def test_what_stands_beside_says_nothing_of_the_type(matcher: ScanMatcher) -> None:
     """A tunnel in view, an obstacle expected 2 m to its left."""
     measured, seen, _ = standing("tunnel", walls=False)
     beside_it = seen + torch.tensor([0.0, 2.0, 0.0, 0.0])
-    assert (matcher.compare(*measured, beside_it) == 0.0).all()
+    assert (matcher.compare(*measured, beside_it)[1] == 0.0).all()
 
 
 @pytest.mark.parametrize("name", ["tire_jump", "a_frame", "tunnel"])

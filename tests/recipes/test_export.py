@@ -89,13 +89,10 @@ def test_a_network_that_is_not_the_trained_policy_is_refused(export: ModuleType,
 
 
 def test_differences_count_as_shares_of_large_outputs(export: ModuleType) -> None:
-    ours, theirs = torch.tensor([[0.5, 20.0]]), torch.tensor([[0.5, 20.4]])
+    ours, theirs = torch.tensor([0.5, 20.0]), torch.tensor([0.5, 20.4])
     assert export.difference([ours], [theirs]) == pytest.approx(0.4 / 20.4)
     assert export.difference([ours], [ours - 0.25]) == 0.25
-    many, off = torch.zeros(3, 2), torch.tensor([[0.1, 0.0], [0.0, 0.3], [0.0, 0.2]])
-    assert [export.difference([many], [off], strays) for strays in (0, 1, 2)] == pytest.approx([0.3, 0.2, 0.1])
-    off[1, 1] = float("nan")
-    assert export.difference([many], [off], 1) == float("inf")
+    assert export.difference([ours * float("nan")], [theirs]) == float("inf")
 
 
 def test_a_student_is_exported_with_its_memory(
@@ -134,10 +131,7 @@ def test_the_shipped_student_is_exported(export: ModuleType, repository: Path, t
     output = tmp_path / "exported"
     assert export.main(export.Config(repository / "pretrained" / "student_leaping", output=output, steps=60)) == output
     entry = Artifact.load(output, kind="student").manifest["onnx"]
-    assert (
-        entry["checked_on"] == "240 recorded inputs, but for the 2 worst"
-        and 0.0 < entry["largest_difference"] <= export.SAME_DECISION
-    )
+    assert entry["checked_on"] == "240 recorded inputs" and 0.0 < entry["largest_difference"] <= export.SAME_DECISION
     exportable = export.student_to_export(export.Config(repository / "pretrained" / "student_leaping", steps=4))
     shifted = replace(exportable, expected=tuple(values + 2e-5 for values in exportable.expected))
     with pytest.raises(ArtifactError, match=r"differs from the training policy by .*, expected at most 1e-05"):
