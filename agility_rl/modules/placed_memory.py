@@ -15,11 +15,10 @@ from agility_rl.modules.planar import bearings, inverse, inverted, moved, planar
 from agility_rl.modules.preview import Preview, preview_parts
 from agility_rl.modules.scan_matching import NOTHING, NUM_MATCH, ScanMatcher
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
+from agility_rl.modules.way_points import reached, shifted, to_come, told_of
 
 NUM_PLACE = 8
 """Way-point, the next one, and the robot's place at the obstacle (:data:`agility_rl.keys.PLACE`)."""
-NEAR = 0.38
-"""Distance at which a way-point is taken for reached [m]; see :func:`reached`."""
 DRIFT = (0.05**2, 0.05**2, 0.01**2)
 """Variance that counting the way adds in a second: ahead, aside [m^2], yaw [rad^2]; measured (docs/student.md)."""
 START = (0.15**2, 0.45**2, 0.2**2)
@@ -67,9 +66,10 @@ class PlacedMemory(nn.Module):
 
     The course is known but for its jitter and the order of its obstacles. b is the belief of a hidden Markov model in
     the way-point that is the present one, of all obstacles of all routes: N goes on to the next one, :math:`\lambda`
-    says of each whether it is :func:`reached`, D leaves some doubt for its neighbours, and the evidence e counts by a
-    share :math:`\kappa`, since images in a row are much alike, and for no obstacle where the robot cannot be
-    (:func:`told_of`). The likeliest way-point says which obstacle the pose is
+    says of each whether it is :func:`~agility_rl.modules.way_points.reached`, back again where the one before is
+    :func:`~agility_rl.modules.way_points.to_come`, D leaves some doubt for its neighbours, and the evidence e counts by
+    a share :math:`\kappa`, since images in a row are much alike, and for no obstacle where the robot cannot be
+    (:func:`~agility_rl.modules.way_points.told_of`). The likeliest way-point says which obstacle the pose is
     seen from and corrected by, as if that stood where it should; and a :class:`~agility_rl.modules.preview.Preview`,
     where from there the next one stands, and of which type it is, as far as it has been in view when that becomes the
     present one. The place then is where the way-points of that type of obstacle lie from there
@@ -108,6 +108,7 @@ class PlacedMemory(nn.Module):
     legs: Tensor
     arena: Tensor
     following: Tensor
+    earlier: Tensor
     next_leg: Tensor
     doubt: Tensor
     prior: Tensor
@@ -134,6 +135,7 @@ class PlacedMemory(nn.Module):
         firsts = [index == 0 or index - 1 in ends for index in range(count)]
         following = torch.tensor([index if index in ends else index + 1 for index in range(count)])
         preceding = torch.tensor([index if firsts[index] else index - 1 for index in range(count)])
+        earlier = torch.tensor([index - (index % points > 0) for index in range(count)])
         self.hidden_size, self.period, self.points = hidden_size, period, points
         self.preview = Preview(num_obstacles)
         self.parts = memory_parts(hidden_size, legs, points, num_obstacles)
@@ -153,6 +155,7 @@ class PlacedMemory(nn.Module):
             "legs": frames,
             "arena": inverse(frames),
             "following": following,
+            "earlier": earlier,
             "next_leg": following[points - 1 :: points] // points,
             "doubt": (1.0 - 2.0 * DOUBT) * stay + DOUBT * (stay[following] + stay[preceding]),
             "prior": CERTAIN * torch.tensor(firsts).float(),
@@ -219,8 +222,9 @@ class PlacedMemory(nn.Module):
         latent, seems, evidence = (known + self.glance.what(feature)).split(self.known, -1)
         points = self._way_points(seems + self.preview.hints(coming)[1])
 
-        done = reached(points[..., None, :, :] - at[..., None, :2]).flatten(-2)
-        belief = (belief * (-done).sigmoid()).index_add(-1, self.following, belief * done.sigmoid())
+        offset = points[..., None, :, :] - at[..., None, :2]
+        belief = shifted(belief, reached(offset).flatten(-2), self.following)
+        belief = shifted(belief, to_come(offset).flatten(-2)[..., self.earlier], self.earlier)
         belief = (belief @ self.doubt).clamp(min=1e-30)
         told = told_of(belief, (weight + CREDIT).sigmoid() * evidence, self._possible(belief, at, points))
         progress = told.flatten(-2)
@@ -313,69 +317,3 @@ class PlacedMemory(nn.Module):
 def of_leg(poses: Tensor, leg: Tensor) -> Tensor:
     """Of poses ``[*B, L, 4]`` that of a leg each, int64 ``[*B]``: ``[*B, 4]``."""
     return poses.take_along_dim(leg[..., None, None], -2)[..., 0, :]
-
-
-def told_of(belief: Tensor, evidence: Tensor, possible: Tensor) -> Tensor:
-    r"""Belief in way-points after evidence, which speaks for another obstacle only where the robot can be at that one.
-
-    .. math:: b(l, w) \propto \bar b(l)\, g(l)\, \bar b_e(w \mid l), \qquad
-              g_e(l) = \sum_w \bar b(w \mid l)\, e^{e(l, w)}, \qquad
-              g(l) = \begin{cases} g_e(l) & l \text{ possible} \\ \min(g_e(l), g_e(\hat l)) \end{cases}
-
-    :math:`\hat l` is the likeliest obstacle, :math:`\bar b_e(w \mid l)` the belief in the way-points of one after the
-    evidence. An image shows much that is the same at several obstacles; and in another arena than that of the training
-    it may speak for a wrong one with every frame, by what lies behind the obstacle ahead (docs/student.md).
-
-    Source: ours.
-
-    Args:
-        belief: ``[*B, L W]``, in W way-points of each of L obstacles; positive.
-        evidence: ``[*B, L W]``, logarithms.
-        possible: bool ``[*B, L]``.
-
-    Returns:
-        ``[*B, L, W]``, log-probabilities.
-
-    Example:
-        >>> belief, evidence = torch.tensor([0.4, 0.4, 0.1, 0.1]), torch.tensor([0.0, 0.0, 2.0, 2.0])
-        >>> told_of(belief, evidence, torch.tensor([True, False])).exp()
-        tensor([[0.4000, 0.4000],
-                [0.1000, 0.1000]])
-        >>> told_of(belief, evidence, torch.tensor([True, True])).exp().sum(-1)
-        tensor([0.3512, 0.6488])
-    """
-    shape = (*possible.shape, belief.shape[-1] // possible.shape[-1])
-    before = belief.log().view(shape)
-    after = before + evidence.reshape(shape)
-    leg = before.logsumexp(-1)
-    gain = after.logsumexp(-1) - leg
-    gain_now = gain.take_along_dim(leg.argmax(-1, keepdim=True), -1)
-    gain = torch.where(possible, gain, torch.minimum(gain, gain_now))
-    told = (leg + gain)[..., None] + after.log_softmax(-1)
-    return told - told.flatten(-2).logsumexp(-1)[..., None, None]
-
-
-def reached(offset: Tensor) -> Tensor:
-    r"""How much speaks for it that a way-point is reached, as a logit: it is near, or just behind.
-
-    .. math:: \max\left(0.38 - d,\ \min(-x - 0.15,\ 0.5 - |y|)\right) / 0.02 \quad \text{within} \pm 8
-
-    The radius is 0.45 m (method notes, section 5.5); who does not know his place to the decimetre does well to go
-    nearer, since a way-point wrongly taken for reached is never reached. One that he has passed should have been.
-
-    Source: ours.
-
-    Args:
-        offset: ``[*B, 2]``, from the robot to it, along and across the obstacle [m].
-
-    Returns:
-        ``[*B]``, without gradient.
-
-    Example:
-        >>> reached(torch.tensor([[0.0, 0.36], [0.45, 0.0], [-0.17, 0.4], [-3.0, 0.9]])).round(decimals=3)
-        tensor([ 1.0000, -3.5000,  1.0000, -8.0000])
-    """
-    offset = offset.detach()
-    near = NEAR - torch.linalg.vector_norm(offset, dim=-1)
-    behind = torch.minimum(-offset[..., 0] - 0.15, 0.5 - offset[..., 1].abs())
-    return (torch.maximum(near, behind) / 0.02).clamp(-8.0, 8.0)

@@ -50,6 +50,8 @@ def said(memory: PlacedMemory, present: torch.Tensor, coming: torch.Tensor) -> t
     return torch.cat((present, coming))[None]
 
 
+ON_THE_WAY = [1.8, 3.7, 0.0, 1.0]
+"""Beside the second way-point of the first obstacle: which one is next, the place does not say."""
 UNSEEN = torch.tensor([0.0, 0.0, 0.0, 1.0, *(NOTHING,) * 3])
 """A match that says nothing."""
 
@@ -236,10 +238,22 @@ def test_who_goes_back_knows_nothing_of_the_obstacle_before() -> None:
 def test_a_way_point_counts_until_it_is_reached() -> None:
     """The second way-point is at x = -0.5, and only where it is the present one is it passed."""
     memory, _ = silent((FIRST, STRAIGHT))
-    for x, y, done in ((-1.5, 0.0, 0.0), (-0.88, 0.0, 0.5), (-0.8, 0.4, 0.0), (-0.5, 0.1, 1.0), (-0.2, 0.4, 1.0)):
+    for x, y, done in ((-1.5, 0.0, 0.0), (-0.92, 0.0, 0.5), (-0.8, 0.4, 0.0), (-0.5, 0.1, 1.0), (-0.2, 0.4, 1.0)):
         *_, progress, _ = memory.step(*still(memory, [2.0 + x, 3.0 + y, 0.0, 1.0], 1))
         assert float(progress.exp()[0, 2]) == pytest.approx(done, abs=0.02)
         assert float(progress.exp()[0, 1]) == pytest.approx(1.0 - done, abs=0.02)
+
+
+@torch.no_grad()
+def test_who_took_a_way_point_for_reached_goes_back_to_it() -> None:
+    """The first way-point is at x = -1.5; that of the second obstacle is not the last one of the first."""
+    memory, _ = silent((FIRST, STRAIGHT))
+    for x, y, back in ((-2.2, 0.0, 1.0), (-2.05, 0.0, 0.5), (-2.0, 0.0, 0.0), (-1.9, 0.5, 1.0), (-1.45, 0.7, 0.0)):
+        *_, progress, _ = memory.step(*still(memory, [2.0 + x, 3.0 + y, 0.0, 1.0], 1))
+        assert float(progress.exp()[0, 0]) == pytest.approx(back, abs=0.08)
+        assert float(progress.exp()[0, 1]) == pytest.approx(1.0 - back, abs=0.08)
+    *_, progress, _ = memory.step(*still(memory, [2.0, 3.0, 0.0, 1.0], 4))
+    assert float(progress.exp()[0, 4]) == pytest.approx(1.0, abs=0.01)
 
 
 @torch.no_grad()
@@ -248,7 +262,7 @@ def test_evidence_multiplies_the_belief() -> None:
     memory, bias = silent((FIRST,))
     bias["progress"][:2] = torch.tensor([0.0, math.log(6.0)])
     bias["weight"].fill_(4.0)
-    *inputs, hidden = still(memory, [-9.0, 0.0, 0.0, 1.0], 1)
+    *inputs, hidden = still(memory, ON_THE_WAY, 1)
     hidden[0, 15] = math.log(3.0) - memory.prior[0]
     *_, progress, _ = memory.step(*inputs, hidden)
     assert float((progress[0, 0] - progress[0, 1]).exp()) == pytest.approx(3.0 / math.sqrt(6.0), rel=1e-2)
@@ -256,12 +270,12 @@ def test_evidence_multiplies_the_belief() -> None:
 
 @torch.no_grad()
 def test_evidence_moves_the_belief_to_a_neighbour() -> None:
-    """Evidence of 4, three times: from a doubt of 1e-3 that is enough, for two way-points further on it is not."""
-    for spoken, follows in ((1, 1), (3, 0)):
+    """Evidence of 4, three times: from a doubt of 1e-3 that is enough. It tells the first from those after it only."""
+    for at, spoken, follows in ((0, 1, 1), (0, 3, 1), (1, 3, 1), (2, 3, 2), (1, 0, 0), (2, 0, 2)):
         memory, bias = silent((FIRST, STRAIGHT))
         bias["progress"][spoken] = 4.0
         bias["weight"].fill_(100.0)
-        *inputs, state = still(memory, [-9.0, 0.0, 0.0, 1.0], 0)
+        *inputs, state = still(memory, ON_THE_WAY, at)
         for _ in range(3):
             *_, state, _, progress, _ = memory.step(*inputs, state)
         torch.testing.assert_close(progress.exp().sum(), torch.tensor(1.0))
@@ -281,7 +295,7 @@ def test_evidence_speaks_for_another_obstacle_only_where_the_robot_can_be() -> N
         (2.85, 3.0, 3, False),  # 0.65 m before its last way-point
         (2.95, 3.0, 3, True),
         (8.2, 4.0, 8, True),  # on the way to the third
-        (8.2, 4.0, 9, False),
+        (6.9, 4.4, 9, False),
     ):
         memory, bias = silent(frames)
         bias["weight"].fill_(100.0)
@@ -316,14 +330,18 @@ def test_routes_do_not_mix() -> None:
 
 @torch.no_grad()
 def test_way_points_are_those_of_the_likeliest_obstacle_and_then_where_the_next_is_entered() -> None:
-    """At (0, 0.5), looking along the first obstacle of two; of its type all way-points lie 1 m further and aside."""
+    """Looking along two obstacles, 0.5 m to their left; of their type all way-points lie 1 m further and aside."""
     memory, bias = silent((FIRST, STRAIGHT))
     memory.way_points[3] += 1.0
     bias["obstacle"][3] = 20.0
     # The entry is the mean over the types: at -1.5 + 1/7 and 1/7 in the frame of the second obstacle, which is 4 m on.
-    entry = [2.5 + 1.0 / 7.0, -0.5 + 1.0 / 7.0]
-    for at, expected in ((0, [-0.5, 0.5, 0.5, 0.5]), (3, [2.5, 0.5, *entry]), (7, [6.5, 0.5, 6.5, 0.5])):
-        *_, place, _, _ = memory.step(*still(memory, [2.0, 3.5, 0.0, 1.0], at))
+    entry = [0.9 + 1.0 / 7.0, -0.5 + 1.0 / 7.0]
+    for x, at, expected in (
+        (2.0, 0, [-0.5, 0.5, 0.5, 0.5]),
+        (3.6, 3, [0.9, 0.5, *entry]),
+        (7.6, 7, [0.9, 0.5, 0.9, 0.5]),
+    ):
+        *_, place, _, _ = memory.step(*still(memory, [x, 3.5, 0.0, 1.0], at))
         torch.testing.assert_close(place[0, :4], torch.tensor(expected), atol=1e-5, rtol=0.0)
 
 
