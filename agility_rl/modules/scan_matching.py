@@ -42,7 +42,7 @@ camera, and roll [rad], and what all depths of an image are off by [m] (uniform 
 within 5 degrees: method notes, section 5.8)."""
 PLANAR = [0, 1, 3]
 """x, y and yaw of these."""
-GRID = 2.0**-7
+GRID = 2.0**-5
 """Matching begins at multiples of this [m, rad]; see :func:`on_grid`."""
 LEAST, SHARE, FAR = 15, 0.3, 0.8
 """A match counts if it explains so many of the raised points, such a share of them, and lies less than so far [m] from
@@ -268,11 +268,11 @@ class ScanMatcher(nn.Module):
 
 
 def on_grid(place: Tensor) -> Tensor:
-    """Places ``[*B, 4]`` (x, y, sine and cosine of the yaw) to 8 mm and 8 mrad: rounding alone no longer tells them
+    """Places ``[*B, 4]`` (x, y, sine and cosine of the yaw) to 3 cm and 0.03 rad: rounding alone no longer tells them
     apart, and a shape that fits in two places is always found in the same one.
 
     Example:
-        >>> on_grid(torch.tensor([1.0001, -0.4999, 0.0001, 1.0]))
+        >>> on_grid(torch.tensor([1.001, -0.499, 0.001, 1.0]))
         tensor([ 1.0000, -0.5000,  0.0000,  1.0000])
     """
     yaw = torch.atan2(place[..., 2], place[..., 3])

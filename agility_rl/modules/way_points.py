@@ -7,7 +7,7 @@ from torch import Tensor
 
 NEAR = 0.42
 """Distance at which a way-point is taken for reached [m]; see :func:`reached`."""
-FAR = 0.55
+FAR = 0.58
 """Distance at which one ahead is not reached [m]; see :func:`to_come`."""
 
 
@@ -93,7 +93,7 @@ def reached(offset: Tensor) -> Tensor:
 def to_come(offset: Tensor) -> Tensor:
     r"""How much speaks for it that a way-point is not reached yet, as a logit: it is ahead, and far.
 
-    .. math:: \min\left(d - 0.55,\ x - 0.1\right) / 0.02 \quad \text{within} \pm 8
+    .. math:: \min\left(d - 0.58,\ x - 0.1\right) / 0.04 \quad \text{within} \pm 8
 
     As long as the type of an obstacle is not seen its first way-point is expected where that of most is; that of weave
     poles lies half a metre behind and beside there. Who has taken it for reached has to go back to it.
@@ -104,9 +104,9 @@ def to_come(offset: Tensor) -> Tensor:
         offset: as :func:`reached`, as is what it returns.
 
     Example:
-        >>> to_come(torch.tensor([[0.56, 0.0], [0.4, 0.5], [0.5, 0.0], [-0.6, 0.0]])).round(decimals=3)
-        tensor([ 0.5000,  4.5160, -2.5000, -8.0000])
+        >>> to_come(torch.tensor([[0.6, 0.0], [0.4, 0.5], [0.5, 0.0], [-0.6, 0.0]])).round(decimals=3)
+        tensor([ 0.5000,  1.5080, -2.0000, -8.0000])
     """
     offset = offset.detach()
     far = torch.linalg.vector_norm(offset, dim=-1) - FAR
-    return (torch.minimum(far, offset[..., 0] - 0.1) / 0.02).clamp(-8.0, 8.0)
+    return (torch.minimum(far, offset[..., 0] - 0.1) / 0.04).clamp(-8.0, 8.0)

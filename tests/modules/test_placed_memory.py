@@ -248,7 +248,7 @@ def test_a_way_point_counts_until_it_is_reached() -> None:
 def test_who_took_a_way_point_for_reached_goes_back_to_it() -> None:
     """The first way-point is at x = -1.5; that of the second obstacle is not the last one of the first."""
     memory, _ = silent((FIRST, STRAIGHT))
-    for x, y, back in ((-2.2, 0.0, 1.0), (-2.05, 0.0, 0.5), (-2.0, 0.0, 0.0), (-1.9, 0.5, 1.0), (-1.45, 0.7, 0.0)):
+    for x, y, back in ((-2.2, 0.0, 1.0), (-2.08, 0.0, 0.5), (-1.93, 0.0, 0.0), (-1.9, 0.6, 1.0), (-1.45, 0.7, 0.0)):
         *_, progress, _ = memory.step(*still(memory, [2.0 + x, 3.0 + y, 0.0, 1.0], 1))
         assert float(progress.exp()[0, 0]) == pytest.approx(back, abs=0.08)
         assert float(progress.exp()[0, 1]) == pytest.approx(1.0 - back, abs=0.08)

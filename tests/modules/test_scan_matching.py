@@ -192,14 +192,17 @@ def test_inverse_of_badly_scaled_matrices() -> None:
 
 
 def test_what_only_rounding_tells_apart_is_matched_alike(matcher: ScanMatcher) -> None:
-    """Whether robots are matched alone or together; also where a shape fits in two places, and with any type."""
+    """Whether robots are matched alone or together, also where a shape fits in two places, and with any type."""
     measured, seen, kind = standing("weave_poles", 1.0)
     inputs = (*measured, on_grid(beside(seen)))
     nearly = (*measured, inputs[-1] * (1.0 + 1e-6))
-    for each in (lambda *rows: matcher.compare(*rows[:-1])[0], matcher.forward):
-        together = each(*inputs, kind)
-        alone = torch.cat([each(*rows) for rows in zip(*(values.split(1) for values in (*nearly, kind)), strict=True)])
-        torch.testing.assert_close(alone, together, rtol=1e-6, atol=1e-6)
+    compared, matched = matcher.compare(*inputs), matcher(*inputs, kind)
+    for row in range(ROBOTS):
+        alone = matcher.compare(*(values[row : row + 1] for values in nearly))
+        for values, together in zip(alone, compared, strict=True):
+            torch.testing.assert_close(values[0], together[row], rtol=1e-6, atol=1e-6)
+        alone_matched = matcher(*(values[row : row + 1] for values in (*nearly, kind)))
+        torch.testing.assert_close(alone_matched[0], matched[row], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", TAUGHT)

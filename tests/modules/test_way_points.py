@@ -15,11 +15,11 @@ def test_no_way_point_is_both_reached_and_to_come() -> None:
     assert (torch.minimum(reached(offset), to_come(offset)) <= 0.0).all()
 
 
-@pytest.mark.parametrize(("logit", "edge", "sign"), [(reached, NEAR, -1.0), (to_come, FAR, 1.0)])
-def test_edges_of_what_lies_straight_ahead(logit: Callable[[Tensor], Tensor], edge: float, sign: float) -> None:
-    """A centimetre is half of the 0.02 m by which both are divided."""
+@pytest.mark.parametrize(("logit", "edge", "slope"), [(reached, NEAR, -0.5), (to_come, FAR, 0.25)])
+def test_edges_of_what_lies_straight_ahead(logit: Callable[[Tensor], Tensor], edge: float, slope: float) -> None:
+    """A centimetre is half of the 0.02 m, a quarter of the 0.04 m, by which they are divided."""
     offset = torch.tensor([[edge, 0.0], [edge + 0.01, 0.0], [edge - 0.01, 0.0]], requires_grad=True)
-    torch.testing.assert_close(logit(offset), sign * torch.tensor([0.0, 0.5, -0.5]), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(logit(offset), slope * torch.tensor([0.0, 1.0, -1.0]), atol=1e-5, rtol=0.0)
     assert not logit(offset).requires_grad
 
 
