@@ -246,9 +246,10 @@ class ScanMatcher(nn.Module):
     def _fit(self, scan: _Scan, kind: Tensor, found: Tensor) -> _Fit:
         """Gauss-Newton from poses ``[N, 7]`` at obstacles of types int64 ``[N]``."""
         valid = scan.valid
-        # So few points, with a type that they are not of, may fit in two places: by doubles always in the same one.
+        # A type that points are not of may fit them in two places: in doubles, rounding does not decide between those.
         start, found, points, rays = (part.double() for part in (scan.start, found, scan.points, scan.rays))
         stiff = (DEVIATION / self.expected.double()).square()
+        prior = torch.diag(stiff)
         for step in range(STEPS):
             width = WIDTH[0] * (WIDTH[1] / WIDTH[0]) ** (step / (STEPS - 1))
             turn, axes = _turned(found, self.turns)
@@ -260,7 +261,7 @@ class ScanMatcher(nn.Module):
             slope = torch.cat((gradient, torch.linalg.cross(ahead, gradient) @ axes, nearer), -1)
             weighted = (slope * weight[..., None]).mT
             pull = (weighted @ distance[..., None])[..., 0] + stiff * (found - start)
-            inverse = inverted_spd(weighted @ slope + torch.diag(stiff))
+            inverse = inverted_spd(weighted @ slope + prior)
             found = found - (inverse @ pull[..., None])[..., 0]
         raised = here[..., 2] > ABOVE
         explained, there = (weight * raised).sum(-1), (valid & covered & raised).sum(-1)
@@ -270,6 +271,8 @@ class ScanMatcher(nn.Module):
 def on_grid(place: Tensor) -> Tensor:
     """Places ``[*B, 4]`` (x, y, sine and cosine of the yaw) to 3 cm and 0.03 rad: rounding alone no longer tells them
     apart, and a shape that fits in two places is always found in the same one.
+
+    Source: ours.
 
     Example:
         >>> on_grid(torch.tensor([1.001, -0.499, 0.001, 1.0]))

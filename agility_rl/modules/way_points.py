@@ -14,6 +14,8 @@ FAR = 0.58
 def shifted(belief: Tensor, logit: Tensor, to: Tensor) -> Tensor:
     """Belief ``[*B, N]`` of which shares, as logits ``[*B, N]``, go from each state to another one, int64 ``[N]``.
 
+    Source: the prediction of a hidden Markov model's forward algorithm (Rabiner 1989, doi:10.1109/5.18626, Eq. 20).
+
     Example:
         >>> shifted(torch.tensor([0.2, 0.8]), torch.tensor([0.0, -20.0]), torch.tensor([1, 1]))
         tensor([0.1000, 0.9000])
