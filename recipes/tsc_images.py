@@ -26,7 +26,7 @@ from safetensors.torch import save_file
 from tensordict import TensorDictBase
 from tsc_artifacts import load_trained
 from tsc_student_config import CPU
-from tsc_student_setup import build, frozen_parts, load_student, resolve
+from tsc_student_setup import build, load_student, resolve, teachers_parts
 
 from agility_rl.training import cli
 
@@ -93,7 +93,7 @@ def collect(cfg: Config) -> TensorDictBase:
     if learner.artifact.manifest["teacher"] != trained.digest:
         print(f"{cfg.student} learned from another teacher than {cfg.teacher}, whose view of the terrain is stored")
     parts = build(run, trained)
-    load_student(parts, cfg.student, frozen_parts(run))
+    load_student(parts, cfg.student, teachers_parts(run))
     parts.collector.led = round(cfg.led * cfg.num_robots)
     rows: list[TensorDictBase] = []
     start = time.monotonic()

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import torch
 from course_metrics import judge, set_course
+from estimation import learn_to_estimate
 from glances import asked, known_terrain, pretrain
 from learning_rates import annealed, set_learning_rate
 from tensordict import TensorDict, TensorDictBase
@@ -32,10 +33,10 @@ from tsc_student_config import PRESETS, Config
 from tsc_student_setup import (
     Components,
     build,
-    frozen_parts,
     load_student,
     resolve,
     save_policy,
+    teachers_parts,
 )
 
 from agility_rl import keys
@@ -151,14 +152,18 @@ def check(cfg: Config) -> None:
         raise ValueError(f"--representation: a minibatch of BYOL needs 2 images or more, got {smallest}")
     if min(glance.every, glance.epochs, glance.batch, glance.kept) < 1 or min(glance.steps, glance.images) < 0:
         raise ValueError("--glance: expected every, epochs, batch and kept above 0, steps and images of at least 0")
+    estimation = cfg.estimation
+    if estimation.robots < 2 or min(estimation.decisions, estimation.epochs, estimation.batch) < 1:
+        raise ValueError("--estimation: expected two robots or more, and decisions, epochs and batch above 0")
     if glance.images and (cfg.env.num_robots < 2 or not 0 < glance.held_out < 1):
         raise ValueError("--glance.images: expected two robots or more, and held-out within (0, 1)")
 
 
 def begin(parts: Components, cfg: Config) -> None:
-    """Start from another run's student, if one is given."""
-    if cfg.init_from is not None:
-        load_student(parts, cfg.init_from, frozen_parts(cfg))
+    """Start from another run's student, if one is given; an estimator of its own, unless that has one, learns first."""
+    inherits = cfg.init_from is not None and load_student(parts, cfg.init_from, teachers_parts(cfg))
+    if cfg.estimator_history and not inherits:
+        learn_to_estimate(parts, cfg)
 
 
 def train(cfg: Config) -> Path:

@@ -137,6 +137,19 @@ class GlanceConfig:
 
 
 @dataclass(frozen=True)
+class EstimationConfig:
+    """How an estimator that reads the history learns (ours)."""
+
+    robots: int = 128
+    """That the teacher leads over the course, without cameras."""
+    decisions: int = 1000
+    epochs: int = 10
+    batch: int = 512
+    learning_rate: float = 2e-3
+    """Falls to 0, epoch by epoch."""
+
+
+@dataclass(frozen=True)
 class Config(HardwareConfig):
     name: str = "student"
     """Folder under ``runs``."""
@@ -175,12 +188,16 @@ class Config(HardwareConfig):
     """Units of the layers that read from those, and an expected place, where the obstacle is (ours)."""
     heading_gate: float = HEADING_GATE
     """Heading errors beyond this are given, not predicted, in training [rad]: 0.6 (method notes, section 5.9)."""
+    estimator_history: bool = False
+    """Whether the state estimator reads the history, and learns before the imitation where the teacher walks (ours);
+    else it is the teacher's. A student that infers its place counts its way by it."""
     env: EnvConfig = field(default_factory=EnvConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
     representation: RepresentationConfig = field(default_factory=RepresentationConfig)
     glance: GlanceConfig = field(default_factory=GlanceConfig)
+    estimation: EstimationConfig = field(default_factory=EstimationConfig)
     curriculum: CurriculumConfig = field(
         default_factory=lambda: CurriculumConfig(difficulty=1.0, obstacles=6, practice=0.0)
     )
@@ -199,6 +216,7 @@ CPU = Config(
     encoder_features=128,
     glance_hidden=(256, 256, 256),
     heading_gate=4.0,
+    estimator_history=True,
     env=EnvConfig(num_robots=64, randomize=False, push_interval=None, command_noise=(0.97, 1.03), start_spread=3.0),
     imitation=ImitationConfig(
         steps=48,
@@ -238,5 +256,6 @@ SMOKE = replace(
     imitation=replace(CPU.imitation, steps=4, epochs=1, minibatches=2),
     representation=replace(CPU.representation, images=8, hidden=16),
     glance=GlanceConfig(images=8, every=1, epochs=1, batch=4, held_out=0.25, kept=16),
+    estimation=EstimationConfig(robots=2, decisions=4, epochs=1, batch=4),
 )
 PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}

@@ -132,6 +132,8 @@ def build(cfg: Config, trained: Trained) -> Components:
         way_points=[[list(point) for point in kind.way_points] for kind in OBSTACLES.values()],
         routes=[[list(leg) for leg in route] for route in env.arena.layout.course.legs],
         solids=[kind.solids() for kind in OBSTACLES.values()],
+        stock=env.arena.layout.course.stock,
+        estimator_history=cfg.estimator_history,
     ).to(device)
     own_points = [slot.obstacle for slot in env.arena.layout.course.slots if slot.goals != slot.kind.way_points]
     if teacher.settings["num_place"] and own_points:
@@ -195,8 +197,13 @@ def build(cfg: Config, trained: Trained) -> Components:
 
 
 def frozen_parts(cfg: Config) -> tuple[str, ...]:
-    """What stays the teacher's: the estimator, since imitation shall not bend what says what can be measured."""
+    """What imitation leaves alone: the estimator, since it shall not bend what says what can be measured."""
     return ("estimator",) if cfg.imitation.actor else ("estimator", "history_encoder", "actor")
+
+
+def teachers_parts(cfg: Config) -> tuple[str, ...]:
+    """What of these is the teacher's."""
+    return tuple(name for name in frozen_parts(cfg) if name != "estimator" or not cfg.estimator_history)
 
 
 def imitated(student: RecurrentStudent, glances: Glances | None) -> list[nn.Parameter]:
@@ -231,16 +238,20 @@ def applied(policy: TensorDictSequential) -> TensorDictSequential:
     return TensorDictSequential(*policy, clip)
 
 
-def load_student(parts: Components, path: Path, kept: tuple[str, ...]) -> None:
+def load_student(parts: Components, path: Path, kept: tuple[str, ...]) -> bool:
     """Start from another run's student, but for the parts that are kept: those that stay this run's teacher's.
+
+    Returns:
+        Whether it brings an estimator such as this run's student has. If not, that stays as it is.
 
     Raises:
         ArtifactError: if it is none, or has other sizes.
     """
     trained = load_trained(path, "student")
     # A student is told what to do and draws nothing: what its teacher's deviations were makes no difference. How often
-    # it decides is this run's: it only counts its way by it; and what obstacles are made of is no matter of weights.
-    ignored = ("initial_std", "min_std", "period", "solids")
+    # it decides is this run's: it only counts its way by it; and what obstacles are made of, and how many of each type
+    # there are, is no matter of weights.
+    ignored = ("initial_std", "min_std", "period", "solids", "stock", "estimator_history")
     own, wanted = trained.network.settings, parts.student.settings
     differ = [name for name in wanted if name not in ignored and own.get(name) != wanted[name]]
     if differ:
@@ -253,9 +264,13 @@ def load_student(parts: Components, path: Path, kept: tuple[str, ...]) -> None:
     weights, fastest = trained.network.state_dict(), fastest_canter(parts.teacher_artifact)
     if trained.fastest_canter != fastest:  # it canters as fast as it did
         weights = rescale_canter(weights, trained.fastest_canter, fastest)
+    inherits = bool(own["estimator_history"] == wanted["estimator_history"])
+    kept = kept if inherits else (*kept, "estimator")
     own_state = parts.student.state_dict()
     own_parts = {name: value for name, value in own_state.items() if name.split(".")[0] in kept}
-    parts.student.load_state_dict(weights | own_parts)
+    others = {name: value for name, value in weights.items() if name.split(".")[0] not in kept}
+    parts.student.load_state_dict(others | own_parts)
+    return inherits
 
 
 def save_policy(parts: Components, cfg: Config, folder: Path) -> None:

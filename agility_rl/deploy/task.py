@@ -54,13 +54,14 @@ class StudentNetwork(nn.Module):
         self.history_encoder: nn.Module = student.history_encoder.module
         self.actor = student.actor.network
         self.measured, self.order = student.measured, list(student.actor[0].in_keys)
+        self.estimated = list(student.estimator.in_keys)
 
     def forward(
         self, depth: Tensor, proprioception: Tensor, history: Tensor, hidden: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Logits, parameters, heading errors [rad], obstacle logits, memory."""
-        estimate = self.estimator(proprioception)
-        known = {keys.DEPTH: depth, keys.PROPRIOCEPTION: proprioception, keys.ESTIMATE: estimate}
+        known = {keys.DEPTH: depth, keys.PROPRIOCEPTION: proprioception, keys.HISTORY: history}
+        known[keys.ESTIMATE] = self.estimator(*(known[name] for name in self.estimated))
         latent, heading, obstacle, after, *places = self.memory.step(
             self.encoder(depth), *(known[name] for name in self.measured), hidden
         )

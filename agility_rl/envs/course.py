@@ -141,6 +141,11 @@ class Course:
             tuple((*self.slots[index].position, self.slots[index].yaw) for index in route) for route in self.routes
         )
 
+    @property
+    def stock(self) -> list[int]:
+        """How many obstacles of each type stand there, as :data:`~agility_rl.envs.obstacles.OBSTACLES` has them."""
+        return [sum(slot.obstacle == name for slot in self.slots) for name in OBSTACLES]
+
     def _check_routes(self) -> None:
         n = len(self.slots)
         for route in self.routes:

@@ -15,6 +15,7 @@ from agility_rl.modules.planar import bearings, inverse, inverted, moved, planar
 from agility_rl.modules.preview import Preview, preview_parts
 from agility_rl.modules.scan_matching import NOTHING, NUM_MATCH, ScanMatcher
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
+from agility_rl.modules.stock import ANY, noted, remaining
 from agility_rl.modules.way_points import reached, shifted, to_come, told_of
 
 NUM_PLACE = 8
@@ -36,15 +37,15 @@ CERTAIN = 8.0
 """Logit of the way-point where an episode starts."""
 
 
-def memory_parts(hidden_size: int, legs: int, points: int, types: int) -> tuple[int, int, int, int, int]:
-    """Numbers of the memory: of the GRU, the pose, its uncertainty, the way-points that it may be on the way to, and
-    what is known of the next obstacle.
+def memory_parts(hidden_size: int, legs: int, points: int, types: int) -> tuple[int, int, int, int, int, int]:
+    """Numbers of the memory: of the GRU, the pose, its uncertainty, the way-points that it may be on the way to,
+    what is known of the next obstacle, and of which types those were that it has met.
 
     Example:
         >>> memory_parts(256, legs=6, points=4, types=7)
-        (256, 4, 3, 24, 21)
+        (256, 4, 3, 24, 21, 42)
     """
-    return hidden_size, NUM_POSE, NUM_SCALES, legs * points, sum(preview_parts(types))
+    return hidden_size, NUM_POSE, NUM_SCALES, legs * points, sum(preview_parts(types)), legs * types
 
 
 class PlacedMemory(nn.Module):
@@ -72,8 +73,9 @@ class PlacedMemory(nn.Module):
     (:func:`~agility_rl.modules.way_points.told_of`). The likeliest way-point says which obstacle the pose is
     seen from and corrected by, as if that stood where it should; and a :class:`~agility_rl.modules.preview.Preview`,
     where from there the next one stands, and of which type it is, as far as it has been in view when that becomes the
-    present one. The place then is where the way-points of that type of obstacle lie from there
-    (:func:`~agility_rl.modules.planar.seen_from`). Who has seen nothing stands before the first obstacle.
+    present one. Types of which none is left, since they were met elsewhere, are unlikely beforehand
+    (:func:`~agility_rl.modules.stock.remaining`). The place then is where the way-points of that type of obstacle lie
+    from there (:func:`~agility_rl.modules.planar.seen_from`). Who has seen nothing stands before the first obstacle.
 
     Source: ours; prediction and correction are those of a Kalman filter (Kalman 1960, doi:10.1115/1.3662552) and of a
     hidden Markov model's forward algorithm (Rabiner 1989, doi:10.1109/5.18626, Eq. 19 and 20). Sizes of fusion and GRU:
@@ -90,18 +92,19 @@ class PlacedMemory(nn.Module):
             (:attr:`agility_rl.envs.Course.legs`).
         glance_hidden: units of the glance's hidden layers.
         solids: ``[K][...]``, what every type of obstacle is made of; without, nothing is matched.
+        stock: ``[K]``, how many obstacles of every type the course has; without, each may be of any.
 
     Attributes:
         size: of the memory: units of the GRU, the pose half a decision later, the variances of x, y and yaw, the
-            belief in L x W way-points as logits, these three less what they are before the first obstacle, and what is
-            known of the next obstacle.
+            belief in L x W way-points as logits, these three less what they are before the first obstacle, what is
+            known of the next obstacle, and of which type that of each of the L slots was.
 
     Example:
         >>> memory = PlacedMemory(32, 45, 16, 7, 0.04, torch.zeros(7, 4, 2), [[(2.0, 3.0, 1.57), (2.0, 7.0, 1.57)]])
         >>> outputs = memory(torch.zeros(5, 3, 32), torch.zeros(5, 3, 45), torch.zeros(5, 3, 4),
         ...     torch.zeros(5, 3, 58, 87), torch.zeros(5, 3, memory.size), torch.zeros(5, 3, 1, dtype=torch.bool))
         >>> [tuple(output.shape) for output in outputs]
-        [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 52), (5, 3, 8), (5, 3, 8), (5, 3, 21)]
+        [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 66), (5, 3, 8), (5, 3, 8), (5, 3, 21)]
     """
 
     way_points: Tensor
@@ -115,6 +118,7 @@ class PlacedMemory(nn.Module):
     starts: Tensor
     drift: Tensor
     uncertain: Tensor
+    stock: Tensor
 
     def __init__(
         self,
@@ -127,6 +131,7 @@ class PlacedMemory(nn.Module):
         routes: Sequence[Sequence[Sequence[float]]] = (((0.0, 0.0, 0.0),),),
         glance_hidden: Sequence[int] = (128,),
         solids: Sequence[Sequence[Solid]] = (),
+        stock: Sequence[int] = (),
     ) -> None:
         super().__init__()
         legs, points = sum(map(len, routes)), way_points.shape[1]
@@ -136,7 +141,7 @@ class PlacedMemory(nn.Module):
         following = torch.tensor([index if index in ends else index + 1 for index in range(count)])
         preceding = torch.tensor([index if firsts[index] else index - 1 for index in range(count)])
         earlier = torch.tensor([index - (index % points > 0) for index in range(count)])
-        self.hidden_size, self.period, self.points = hidden_size, period, points
+        self.hidden_size, self.period, self.points, self.types = hidden_size, period, points, num_obstacles
         self.preview = Preview(num_obstacles)
         self.parts = memory_parts(hidden_size, legs, points, num_obstacles)
         self.size = sum(self.parts)
@@ -162,6 +167,7 @@ class PlacedMemory(nn.Module):
             "starts": within(before, inverse(frames)),
             "drift": period * torch.tensor(DRIFT),
             "uncertain": torch.tensor(START),
+            "stock": torch.tensor(stock or [ANY] * num_obstacles, dtype=frames.dtype),
         }
         for name, value in constants.items():
             self.register_buffer(name, value, persistent=False)
@@ -196,7 +202,7 @@ class PlacedMemory(nn.Module):
         """
         if start is None:
             return hidden.masked_fill(is_init, 0.0)
-        sizes = (self.hidden_size, NUM_SCALES, self.preview.size)
+        sizes = (self.hidden_size, NUM_SCALES, sum(self.parts[4:]))
         empty, unsure, unseen = (hidden.new_zeros(*hidden.shape[:-1], size) for size in sizes)
         pose = self._marginals(start)[0] @ self.starts - self.starts[0]
         return torch.where(
@@ -209,7 +215,8 @@ class PlacedMemory(nn.Module):
         self, feature: Tensor, proprioception: Tensor, estimate: Tensor, look: Tensor, hidden: Tensor
     ) -> tuple[Tensor, ...]:
         """One step of ``[*B]``, with outputs as :meth:`forward`."""
-        remembered, pose, variance, belief, coming = hidden.split(self.parts, -1)
+        remembered, pose, variance, belief, coming, met = hidden.split(self.parts, -1)
+        met = met.unflatten(-1, (-1, self.types))
         belief = (belief + self.prior).softmax(-1)
         variance = (variance + self.uncertain).clamp(min=0.0) + self.drift
         motion = 0.5 * self.period * planar_motion(proprioception, estimate)
@@ -220,7 +227,7 @@ class PlacedMemory(nn.Module):
         remembered = self._remember(torch.cat((feature, proprioception, expected.detach()), -1), remembered)
         known, alike, weight = self.head(remembered).split((sum(self.known), NUM_SCALES, 1), -1)
         latent, seems, evidence = (known + self.glance.what(feature)).split(self.known, -1)
-        points = self._way_points(seems + self.preview.hints(coming)[1])
+        points = self._way_points(seems + self.preview.hints(coming)[1] + remaining(met, before, self.stock))
 
         offset = points[..., None, :, :] - at[..., None, :2]
         belief = shifted(belief, reached(offset).flatten(-2), self.following)
@@ -235,7 +242,9 @@ class PlacedMemory(nn.Module):
         local = of_leg(at, leg)
         ahead = inverted(torch.where(changed & onwards, self.preview.place(coming, local), local))
         coming = torch.where(changed, self.preview.arrived(coming, onwards), coming)
-        logits = seems + self.preview.hints(coming)[1]
+        logits = seems + self.preview.hints(coming)[1] + remaining(met, leg, self.stock)
+        met = noted(met, leg, logits)
+        likely = remaining(met, self.next_leg[leg], self.stock)
         said, scale = self.glance.where(feature, ahead, leg)
         ahead, variance = corrected(ahead, variance, said, 2.0 * (2.0 * scale + alike + ALIKE).exp())
         measured = look, proprioception, estimate
@@ -244,11 +253,13 @@ class PlacedMemory(nn.Module):
         obstacle = inverted(ahead)
         pose = of_leg(within(obstacle, self.arena), leg)
         slot = of_leg(within(pose, self.legs), self.next_leg[leg]).detach()
-        sight = self._sight(*measured, coming, slot, self.next_leg[leg] != leg)
+        sight = self._sight(*measured, coming, slot, likely, self.next_leg[leg] != leg)
         coming = self.preview.told(coming, slot, sight)
-        place = torch.cat((self._goals(now, obstacle, self._way_points(logits), coming, slot), obstacle), -1)
+        entry = self._way_points(self.preview.hints(coming)[0] + likely)[..., :1, :]
+        entered = seen_from(self.preview.place(coming, slot), entry)
+        place = torch.cat((self._goals(now, obstacle, self._way_points(logits), entered), obstacle), -1)
         pose = moved(pose, motion) - self.starts[0]
-        after = (remembered, pose, variance - self.uncertain, progress - self.prior, coming)
+        after = (remembered, pose, variance - self.uncertain, progress - self.prior, coming, met.flatten(-2))
         said = torch.cat((match, sight), -1)
         return latent.tanh(), bearings(place), logits, torch.cat(after, -1), place, progress, said
 
@@ -263,7 +274,14 @@ class PlacedMemory(nn.Module):
         return match.reshape(*expected.shape[:-1], NUM_MATCH)
 
     def _sight(
-        self, look: Tensor, proprioception: Tensor, estimate: Tensor, coming: Tensor, slot: Tensor, is_next: Tensor
+        self,
+        look: Tensor,
+        proprioception: Tensor,
+        estimate: Tensor,
+        coming: Tensor,
+        slot: Tensor,
+        likely: Tensor,
+        is_next: Tensor,
     ) -> Tensor:
         """What shapes say of the next obstacle, ``[*B, 7 + K]``."""
         if look.shape[-1] == self.said:
@@ -271,7 +289,7 @@ class PlacedMemory(nn.Module):
         if self.matcher is None:
             return self.preview.silence(coming, slot)
         images, going = look.reshape(-1, *look.shape[-2:]), is_next.reshape(-1)
-        rows = (part.reshape(-1, part.shape[-1]) for part in (proprioception, estimate, coming, slot))
+        rows = (part.reshape(-1, part.shape[-1]) for part in (proprioception, estimate, coming, slot, likely))
         sight = self.preview.look(self.matcher, going, images, *rows)
         return sight.reshape(*slot.shape[:-1], -1)
 
@@ -284,12 +302,12 @@ class PlacedMemory(nn.Module):
         """Way-points of an obstacle in its frame ``[*B, W, 2]``, by the types that it may be."""
         return torch.einsum("...k,kwc->...wc", logits.detach().softmax(-1), self.way_points)
 
-    def _goals(self, now: Tensor, obstacle: Tensor, points: Tensor, coming: Tensor, slot: Tensor) -> Tensor:
-        """The way-point ``now`` and the one after it, seen from the robot: ``[*B, 4]``."""
+    def _goals(self, now: Tensor, obstacle: Tensor, points: Tensor, entered: Tensor) -> Tensor:
+        """The way-point ``now`` and the one after it, seen from the robot: ``[*B, 4]``.
+
+        After the last way-point of an obstacle comes where the next one is entered, ``[*B, 1, 2]``.
+        """
         following = self.following[now]
-        # After the last way-point of an obstacle comes where the next one is entered, by the types that it may be.
-        entry = self._way_points(self.preview.hints(coming)[0])[..., :1, :]
-        entered = seen_from(self.preview.place(coming, slot), entry)
         candidates = torch.cat((seen_from(obstacle, points), entered), -2)
         first = now % self.points
         second = torch.where(following == now, first, first + 1)

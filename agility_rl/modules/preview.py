@@ -123,6 +123,7 @@ class Preview(nn.Module):
         estimate: Tensor,
         memory: Tensor,
         at_slot: Tensor,
+        likely: Tensor,
     ) -> Tensor:
         """What images say of the next obstacle, ``[N, 7 + K]``: a match, and evidence for its types.
 
@@ -134,6 +135,7 @@ class Preview(nn.Module):
             estimate: ``[N, 4]``.
             memory: ``[N, M]``.
             at_slot: the robot's place at the next slot, ``[N, 4]``.
+            likely: how likely types are beforehand, logits ``[N, K]``.
         """
         silence = self.silence(memory, at_slot)
         expected = silence[:, :NUM_POSE]
@@ -144,7 +146,7 @@ class Preview(nn.Module):
         measured = [part[rows] for part in (depth, proprioception, estimate, expected)]
         matches, share = matcher.compare(*measured)
         evidence = EVIDENCE * share
-        likeliest = (self.hints(memory)[0][rows] + evidence).argmax(-1)
+        likeliest = ((self.hints(memory)[0] + likely)[rows] + evidence).argmax(-1)
         match = matches.take_along_dim(likeliest[:, None, None], 1)[:, 0]
         said = silence.index_copy(0, rows, torch.cat((match, evidence), -1))
         return torch.where(visible[:, None], said, silence)

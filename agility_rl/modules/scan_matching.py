@@ -17,8 +17,6 @@ NUM_MATCH = NUM_POSE + NUM_SCALES
 """Numbers of a match: where the obstacle is seen, and the variances of that."""
 LATENCY = constants.CONTROL_DT
 """Age of an image when it is matched [s]: one frame (method notes, section 5.8)."""
-STRIDE = 2
-"""Every second pixel, each way, is looked at."""
 NEAREST, FARTHEST = 0.5, 3.9
 """Depths that count [m]: what is nearer may be the robot's own leg, what is farther nothing."""
 RAISED, GROUND = 192, 64
@@ -140,7 +138,7 @@ class ScanMatcher(nn.Module):
     def __init__(self, types: Sequence[Sequence[Solid]]) -> None:
         super().__init__()
         self.field = DistanceField(types)
-        rays = camera.pixel_directions()[::STRIDE, ::STRIDE].flatten(0, 1)
+        rays = camera.pixel_directions().flatten(0, 1)
         shuffled = torch.rand(len(rays), generator=torch.Generator().manual_seed(0))
         cross = torch.tensor(_CROSS, dtype=torch.float64)
         for name, value in {
@@ -227,7 +225,7 @@ class ScanMatcher(nn.Module):
         robot = moved(inverted(expected), -motion)
         height, yaw = estimate[:, 0], torch.atan2(robot[:, 2], robot[:, 3])
         start = torch.stack((robot[:, 0], robot[:, 1], height, yaw, pitch, roll, torch.zeros_like(roll)), -1)
-        metres = camera.metres(depth[..., ::STRIDE, ::STRIDE]).flatten(1)
+        metres = camera.metres(depth).flatten(1)
         points = metres[..., None] * self.rays + self.mount
         up = torch.stack((-pitch.sin(), pitch.cos() * roll.sin(), pitch.cos() * roll.cos()), -1)
         above = (points @ up[..., None])[..., 0] + height[:, None]

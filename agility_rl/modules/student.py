@@ -53,9 +53,10 @@ class RecurrentStudent(nn.Module):
     the episode (the release carries it on).
 
     Keys read: ``depth`` [*B, 58, 87], ``proprioception`` [*B, 45], ``history`` [*B, 10, 45], ``hidden`` [*B, 512]
-    (with ``num_place`` 7 more, one for every way-point of the course, and 7 and two for every type of obstacle),
-    ``is_init`` bool [*B, 1], true in the first step of an episode; with assistance ``heading_error`` [*B, 2] too, and
-    with ``num_place`` also ``progress`` [*B, S], of which the first of an episode counts.
+    (with ``num_place`` 7 more, one for every way-point of the course, 7 and two for every type of obstacle, and one for
+    every type at every slot of the course), ``is_init`` bool [*B, 1], true in the first step of an episode; with
+    assistance ``heading_error`` [*B, 2] too, and with ``num_place`` also ``progress`` [*B, S], of which the first of an
+    episode counts.
     Keys written: ``depth_feature`` [*B, F], ``terrain_latent`` [*B, 32], ``heading_estimate`` [*B, 2],
     ``obstacle_logits`` [*B, 7], ``(memory, hidden)`` [*B, 512], ``(perceived, heading_error)``,
     ``(perceived, obstacle)``, with ``num_place`` also ``place_estimate`` [*B, 8], ``progress_logits`` [*B, S],
@@ -81,6 +82,10 @@ class RecurrentStudent(nn.Module):
             the place knows that too, but for the jitter.
         solids: ``[K][...]``, what every type of obstacle is made of; who infers the place and knows them matches them
             with what images measure.
+        estimator_history: whether the state estimator reads the history, and so is the student's own: its velocity is
+            what the way is counted by (ours). Else it is the teacher's, which reads the present alone.
+        stock: ``[K]``, how many obstacles of every type the course has (:attr:`agility_rl.envs.Course.stock`); who
+            infers the place and knows that takes none for of a type of which none is left.
 
     Raises:
         ValueError: if ``num_place`` is another number, or obstacles lack way-points or solids.
@@ -114,6 +119,8 @@ class RecurrentStudent(nn.Module):
         way_points: Sequence[Sequence[Sequence[float]]] = (),
         routes: Sequence[Sequence[Sequence[float]]] = (((0.0, 0.0, 0.0),),),
         solids: Sequence[Sequence[Solid]] = (),
+        stock: Sequence[int] = (),
+        estimator_history: bool = False,
     ) -> None:
         super().__init__()
         if num_place not in (0, NUM_PLACE):
@@ -122,6 +129,8 @@ class RecurrentStudent(nn.Module):
             raise ValueError(f"expected way_points of {num_obstacles} types of obstacles, got {len(way_points)}")
         if solids and len(solids) != num_obstacles:
             raise ValueError(f"expected solids of {num_obstacles} types of obstacles, got {len(solids)}")
+        if stock and len(stock) != num_obstacles:
+            raise ValueError(f"expected stock of {num_obstacles} types of obstacles, got {len(stock)}")
         self.settings: dict[str, Any] = {
             "num_obstacles": num_obstacles,
             "hidden": list(hidden),
@@ -134,15 +143,20 @@ class RecurrentStudent(nn.Module):
             "encoder_hidden": encoder_hidden,
             "encoder_features": encoder_features,
             "heading_gate": heading_gate,
+            "estimator_history": estimator_history,
             **({"period": period, "way_points": way_points, "routes": routes} if num_place else {}),
-            **({"glance_hidden": list(glance_hidden), "solids": solids} if num_place else {}),
+            **({"glance_hidden": list(glance_hidden), "solids": solids, "stock": list(stock)} if num_place else {}),
         }
         self.depth_encoder = DepthEncoder(encoder_features, channels=encoder_channels, hidden=encoder_hidden)
-        self.estimator = StateEstimator(features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT)
+        frames, read = (features.HISTORY, keys.HISTORY) if estimator_history else (1, keys.PROPRIOCEPTION)
+        self.estimator = StateEstimator(frames * features.NUM_PROPRIOCEPTION, features.NUM_EXPLICIT, in_keys=(read,))
         self.history_encoder = HistoryEncoder(features.NUM_PROPRIOCEPTION, out_features=NUM_LATENT)
         sizes = (encoder_features, features.NUM_PROPRIOCEPTION, memory, num_obstacles)
-        course = (torch.tensor(way_points), routes)
-        self.memory = PlacedMemory(*sizes, period, *course, glance_hidden, solids) if num_place else Memory(*sizes)
+        self.memory: Memory | PlacedMemory = (
+            PlacedMemory(*sizes, period, torch.tensor(way_points), routes, glance_hidden, solids, stock)
+            if num_place
+            else Memory(*sizes)
+        )
         self.measured = [keys.PROPRIOCEPTION, *([keys.ESTIMATE, keys.DEPTH] if num_place else [])]
         self.heading_gate = heading_gate
         inputs: dict[NestedKey, int] = {
@@ -165,9 +179,10 @@ class RecurrentStudent(nn.Module):
 
     @classmethod
     def from_teacher(cls, teacher: Teacher, **options: Any) -> RecurrentStudent:
-        """A student with a teacher's sizes and copies of its actor, estimator and history encoder."""
+        """A student with a teacher's sizes and copies of its actor, history encoder and estimator, but its own."""
         student = cls(**teacher.settings, **options)
-        for name in ("actor", "estimator", "history_encoder"):
+        own_estimator = student.settings["estimator_history"]
+        for name in ("actor", "history_encoder", *([] if own_estimator else ["estimator"])):
             getattr(student, name).load_state_dict(getattr(teacher, name).state_dict())
         return student
 

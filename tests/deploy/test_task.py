@@ -32,12 +32,15 @@ POINTS = [[[x, 0.0] for x in (-1.5, -0.5, 0.5, 1.5)] for _ in range(7)]
 BALL = ["sphere", [0.4], [0.0, 0.0, 0.4], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0]]
 
 
-@pytest.fixture(params=[(0, []), (8, []), (8, [[BALL]] * 7)], ids=["headings only", "place", "shapes"])
+SHAPES = {"solids": [[BALL]] * 7, "stock": [1] * 7, "estimator_history": True}
+
+
+@pytest.fixture(params=[(0, {}), (8, {}), (8, SHAPES)], ids=["headings only", "place", "shapes"])
 def student(request: pytest.FixtureRequest) -> RecurrentStudent:
     """Random weights, biases included."""
-    num_place, solids = request.param
+    num_place, options = request.param
     network = RecurrentStudent(
-        hidden=(32, 16), num_place=num_place, memory=24, encoder_hidden=16, way_points=POINTS, solids=solids
+        hidden=(32, 16), num_place=num_place, memory=24, encoder_hidden=16, way_points=POINTS, **options
     )
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():

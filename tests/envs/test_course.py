@@ -8,6 +8,8 @@ from dataclasses import replace
 import pytest
 
 from agility_rl.envs.course import Course, CourseError, Jitter, Slot
+from agility_rl.envs.course_presets import COURSES
+from agility_rl.envs.obstacles import OBSTACLES
 
 HURDLE = Slot("bar_jump", (2.0, 3.0), yaw=math.pi / 2)
 TUNNEL = Slot("tunnel", (2.0, 7.0), yaw=math.pi / 2)
@@ -23,6 +25,12 @@ def test_legs_are_the_slots_of_every_route_in_order() -> None:
     there_and_back = replace(COURSE, routes=((1,), (0, 1)))
     tunnel, hurdle = (2.0, 7.0, math.pi / 2), (2.0, 3.0, math.pi / 2)
     assert there_and_back.legs == ((tunnel,), (hurdle, tunnel))
+
+
+def test_the_stock_is_how_many_of_each_type_stand_there() -> None:
+    counts = {name: dict(zip(OBSTACLES, COURSES[name].stock, strict=True)) for name in ("full", "hurdles")}
+    assert counts["full"] == dict.fromkeys(OBSTACLES, 1) | {"box_jump": 0}
+    assert counts["hurdles"] == dict.fromkeys(OBSTACLES, 0) | {"bar_jump": 2}
 
 
 def test_what_a_slot_leaves_open_comes_from_its_type() -> None:

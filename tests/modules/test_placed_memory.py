@@ -11,6 +11,7 @@ from agility_rl.modules.placed_memory import ALIKE, DRIFT, START, PlacedMemory
 from agility_rl.modules.planar import moved
 from agility_rl.modules.preview import NEXT, STRONGEST
 from agility_rl.modules.scan_matching import NOTHING, ScanMatcher
+from agility_rl.modules.stock import NOTED
 
 POINTS = torch.tensor([-1.5, -0.5, 0.5, 1.5])[:, None] * torch.tensor([1.0, 0.0]).expand(7, 1, 2)
 
@@ -19,9 +20,11 @@ FIRST, STRAIGHT, BACK = (2.0, 3.0, 0.0), (6.0, 3.0, 0.0), (6.0, 5.0, math.pi)
 """Three obstacles in the arena: the second is 4 m ahead of the first, the third 2 m beside it, facing the other way."""
 
 
-def silent(*routes: tuple[tuple[float, float, float], ...]) -> tuple[PlacedMemory, dict[str, torch.Tensor]]:
+def silent(
+    *routes: tuple[tuple[float, float, float], ...], stock: tuple[int, ...] = ()
+) -> tuple[PlacedMemory, dict[str, torch.Tensor]]:
     """A memory whose head and glance say what their biases say, and views of those by name; nothing counts."""
-    memory = PlacedMemory(32, 45, 8, 7, 0.05, POINTS.clone(), routes or (((0.0, 0.0, 0.0),),))
+    memory = PlacedMemory(32, 45, 8, 7, 0.05, POINTS.clone(), routes or (((0.0, 0.0, 0.0),),), stock=stock)
     with torch.no_grad():
         for layer in (memory.head[0], memory.glance.linear[0]):
             layer.weight.zero_()
@@ -42,7 +45,7 @@ def still(memory: PlacedMemory, pose: list[float], at: int | None = None) -> tup
         belief[at] = 0.0
     before = torch.cat((torch.tensor(pose) - memory.starts[0], torch.zeros(3), belief - memory.prior))
     seen = torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4), torch.zeros(1, 58, 87)
-    return *seen, torch.cat((torch.zeros(8), before, torch.zeros(memory.preview.size)))[None]
+    return *seen, torch.cat((torch.zeros(8), before, torch.zeros(sum(memory.parts[4:]))))[None]
 
 
 def said(memory: PlacedMemory, present: torch.Tensor, coming: torch.Tensor) -> torch.Tensor:
@@ -221,16 +224,33 @@ def test_what_was_seen_of_the_next_obstacle_counts_when_that_is_the_present_one(
 
 
 @torch.no_grad()
+def test_of_a_type_that_was_met_elsewhere_none_is_left() -> None:
+    """One of each of three: slots 0 and 1 held types 0 and 2, so the one at slot 2 is of type 1, whatever it seems."""
+    route, stock = (FIRST, STRAIGHT, BACK), (1, 1, 1, 0, 0, 0, 0)
+    for counts, likeliest in ((stock, 1), ((), 2)):
+        memory, bias = silent(route, stock=counts)
+        bias["obstacle"].copy_(torch.tensor([1.0, 0.0, 2.0, 1.0, 1.0, 1.0, 1.0]))
+        *seen, state = still(memory, [8.0, 5.0, 0.0, -1.0], 8)
+        met = state.split(memory.parts, -1)[5].view(3, 7)
+        met[0, 0] = met[1, 2] = 1.0
+        *_, logits, after, _, _, _ = memory.step(*seen, state)
+        assert int(logits.argmax()) == likeliest
+        noted = after.split(memory.parts, -1)[5].view(3, 7)
+        torch.testing.assert_close(noted[2], NOTED * logits[0].softmax(-1))
+        assert torch.equal(noted[:2], met[:2])
+
+
+@torch.no_grad()
 def test_who_goes_back_knows_nothing_of_the_obstacle_before() -> None:
     """Evidence for the first of two, seen from the second: what was seen of the one after it says nothing of that."""
     memory, bias = silent((FIRST, STRAIGHT, BACK))
     bias["weight"].fill_(100.0)
     bias["progress"][3] = 40.0
     *seen, state = still(memory, [4.0, 3.0, 0.0, 1.0], 4)
-    state[0, -21:] = torch.rand(21)
+    state.split(memory.parts, -1)[4].copy_(torch.rand(1, 21))
     *_, state, place, progress, _ = memory.step(*seen, state)
     assert int(progress.argmax()) == 3
-    torch.testing.assert_close(state[0, -21:], torch.zeros(21), atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(state.split(memory.parts, -1)[4], torch.zeros(1, 21), atol=1e-6, rtol=0.0)
     torch.testing.assert_close(place[0, 4:], torch.tensor([2.0, 0.0, 0.0, 1.0]), atol=1e-4, rtol=0.0)
 
 
@@ -324,7 +344,7 @@ def test_an_episode_begins_before_the_first_obstacle_unless_told_otherwise() -> 
 def test_routes_do_not_mix() -> None:
     """The hurdle, then the ramp or the tunnel: who is on the first route stays on it."""
     memory = PlacedMemory(32, 45, 8, 7, 0.04, POINTS, COURSES["bidirectional"].legs)
-    assert memory.parts == (8, 4, 3, 16, 21) and memory.prior.nonzero()[:, 0].tolist() == [0, 8]
+    assert memory.parts == (8, 4, 3, 16, 21, 28) and memory.prior.nonzero()[:, 0].tolist() == [0, 8]
     assert memory.following.tolist() == [1, 2, 3, 4, 5, 6, 7, 7, 9, 10, 11, 12, 13, 14, 15, 15]
 
 

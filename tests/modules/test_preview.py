@@ -12,7 +12,7 @@ from agility_rl.modules.preview import ALIKE, EVIDENCE, NEXT, STRONGEST, VIEW_AN
 from agility_rl.modules.scan_matching import FLOOR, NOTHING, ScanMatcher
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0)
-BLOCK, PEBBLE = (("box", size, (0.0, 0.0, size[2]), *UPRIGHT) for size in ((0.4, 0.8, 0.8), (0.02, 0.02, 0.02)))
+BLOCK, PEBBLE = (("box", size, (0.0, 0.0, size[2]), *UPRIGHT) for size in ((0.4, 1.0, 0.8), (0.02, 0.02, 0.02)))
 STANDING = torch.tensor([[0.27, 0.0, 0.0, 0.0]])
 
 
@@ -30,15 +30,20 @@ def known(preview: Preview, rows: int = 1) -> torch.Tensor:
     return memory
 
 
+def evenly(preview: Preview, memory: torch.Tensor) -> torch.Tensor:
+    """No type is likelier beforehand than another."""
+    return torch.zeros_like(preview.hints(memory)[0])
+
+
 def test_the_likeliest_type_is_matched_where_its_shape_fits() -> None:
     """A block in view, expected 0.1 m too near; the other two types are pebbles."""
     preview, matcher = Preview(3), ScanMatcher([[PEBBLE], [BLOCK], [PEBBLE]])
     memory, place = torch.zeros(1, preview.size), torch.tensor([[-2.2, 0.0, 0.0, 1.0]])
     measured = block_ahead(), torch.zeros(1, 45), STANDING
-    said = preview.look(matcher, torch.tensor([True]), *measured, memory, place)
+    said = preview.look(matcher, torch.tensor([True]), *measured, memory, place, evenly(preview, memory))
     assert said.shape == (1, preview.said) and said[0, 0].item() == pytest.approx(2.305, abs=0.03)
     assert bool((said[0, 4:7] < 0.1**2).all())
-    assert 0.7 * EVIDENCE < said[0, 8].item() < EVIDENCE and said[0, [7, 9]].max() < 0.1
+    assert 0.8 * EVIDENCE < said[0, 8].item() < EVIDENCE and said[0, [7, 9]].max() < 0.1
     after = preview.told(memory, place, said)
     hints, present = preview.hints(after)
     assert int(hints.argmax()) == 1 and not present.any()
@@ -54,13 +59,24 @@ def test_the_likeliest_type_is_matched_where_its_shape_fits() -> None:
     assert bool((said[0, 4:7] >= torch.tensor(FLOOR).square()).all())
 
 
+def test_a_type_that_is_unlikely_beforehand_is_not_matched() -> None:
+    """Evidence is what it was, but the pebble is what it is taken for, and that fits nowhere."""
+    preview, matcher = Preview(2), ScanMatcher([[PEBBLE], [BLOCK]])
+    memory, place = torch.zeros(1, preview.size), torch.tensor([[-2.2, 0.0, 0.0, 1.0]])
+    inputs = matcher, torch.tensor([True]), block_ahead(), torch.zeros(1, 45), STANDING, memory, place
+    even = preview.look(*inputs, evenly(preview, memory))
+    pebble = preview.look(*inputs, torch.tensor([[0.0, -1.0]]))
+    assert torch.equal(even[:, 7:], pebble[:, 7:])
+    assert bool((even[0, 4:7] < 0.1**2).all()) and bool((pebble[0, 4:7] == NOTHING).all())
+
+
 @pytest.mark.parametrize(("x", "is_next"), [(-2.2, False), (-VIEW_DISTANCE - 0.3, True), (2.2, True)])
 def test_what_is_out_of_view_or_not_there_is_left_as_it_was(x: float, is_next: bool) -> None:
     preview, matcher = Preview(2), ScanMatcher([[BLOCK], [PEBBLE]])
     memory, place = known(preview), torch.tensor([[x, 0.0, 0.0, 1.0]])
     memory[:, 7:] = 0.0
     measured = block_ahead(), torch.zeros(1, 45), STANDING
-    said = preview.look(matcher, torch.tensor([is_next]), *measured, memory, place)
+    said = preview.look(matcher, torch.tensor([is_next]), *measured, memory, place, evenly(preview, memory))
     assert torch.equal(said, preview.silence(memory, place)) and (said[:, 4:7] == NOTHING).all()
     torch.testing.assert_close(preview.told(memory, place, said), memory, atol=1e-6, rtol=0.0)
 
@@ -71,10 +87,12 @@ def test_rows_do_not_mix() -> None:
     place = torch.tensor([[2.2, 0.0, 0.0, 1.0], [-2.2, 0.0, 0.0, 1.0], [2.2, 0.0, 0.0, 1.0], [-2.4, 0.0, 0.0, 1.0]])
     measured = block_ahead().expand(4, -1, -1), torch.zeros(4, 45), STANDING.expand(4, 4)
     memory, there = torch.zeros(4, preview.size), torch.ones(4, dtype=torch.bool)
-    said = preview.look(matcher, there, *measured, memory, place)
+    said = preview.look(matcher, there, *measured, memory, place, evenly(preview, memory))
     assert (said[:, 4] < NOTHING).tolist() == [False, True, False, True]
     torch.testing.assert_close(said[[1, 3], 0], torch.full((2,), 2.305), atol=0.03, rtol=0.0)
-    alone = preview.look(matcher, there[3:], *(part[3:] for part in measured), memory[3:], place[3:])
+    alone = preview.look(
+        matcher, there[3:], *(part[3:] for part in measured), memory[3:], place[3:], evenly(preview, memory[3:])
+    )
     torch.testing.assert_close(alone[0], said[3], atol=1e-4, rtol=1e-3)
 
 

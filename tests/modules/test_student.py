@@ -14,10 +14,13 @@ WAY_POINTS = [[[x, 0.0] for x in (-1.5, -0.5, 0.5, 1.5)] for _ in range(7)]
 BALL = ["sphere", [0.4], [0.0, 0.0, 0.4], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0]]
 
 
-@pytest.fixture(params=[(0, []), (8, []), (8, [[BALL]] * 7)], ids=["headings only", "place", "shapes"])
+SHAPES = {"solids": [[BALL]] * 7, "stock": [1] * 7, "estimator_history": True}
+
+
+@pytest.fixture(params=[(0, {}), (8, {}), (8, SHAPES)], ids=["headings only", "place", "shapes"])
 def either(request: pytest.FixtureRequest) -> RecurrentStudent:
-    num_place, solids = request.param
-    return RecurrentStudent(num_place=num_place, memory=M, way_points=WAY_POINTS, solids=solids)
+    num_place, options = request.param
+    return RecurrentStudent(num_place=num_place, memory=M, way_points=WAY_POINTS, **options)
 
 
 @pytest.fixture
@@ -56,7 +59,7 @@ def test_sizes_are_those_of_the_supplement() -> None:
     assert student.memory.fusion[0].in_features == 32 + 45
     assert student.memory.head[0].out_features == 32 + 2 + 7
     placed = RecurrentStudent(num_place=8, way_points=WAY_POINTS).memory
-    assert (placed.cell.input_size, placed.cell.hidden_size, placed.size) == (32, 512, 544)
+    assert (placed.cell.input_size, placed.cell.hidden_size, placed.size) == (32, 512, 551)
     assert placed.head[0].out_features == 32 + 7 + 4 + 3 + 1
 
 
@@ -164,6 +167,9 @@ def test_from_a_teacher() -> None:
         mine, its = getattr(student, name), getattr(teacher, name)
         assert all(torch.equal(a, b) for a, b in zip(mine.parameters(), its.parameters(), strict=True))
         assert not {id(p) for p in mine.parameters()} & {id(p) for p in its.parameters()}
+    own = RecurrentStudent.from_teacher(teacher, memory=M, estimator_history=True)
+    assert all(torch.equal(a, b) for a, b in zip(own.actor.parameters(), teacher.actor.parameters(), strict=True))
+    assert own.estimator.in_keys == ["history"] and next(own.estimator.parameters()).shape == (128, 10 * 45)
     # Knowing what the teacher knows, its actor does what the teacher's does.
     td = steps(1, 3)[0].update({"obstacle": torch.eye(7)[:3], "scandots": torch.randn(3, 132)})
     with set_interaction_type(InteractionType.DETERMINISTIC):
@@ -196,6 +202,8 @@ def test_who_infers_a_place_knows_the_obstacles() -> None:
         RecurrentStudent(num_place=8)
     with pytest.raises(ValueError, match="expected solids of 7 types of obstacles, got 1"):
         RecurrentStudent(num_place=8, way_points=WAY_POINTS, solids=[[BALL]])
+    with pytest.raises(ValueError, match="expected stock of 7 types of obstacles, got 2"):
+        RecurrentStudent(num_place=8, way_points=WAY_POINTS, stock=[1, 1])
     with pytest.raises(ValueError, match="num_place must be 0 or 8, got 3"):
         RecurrentStudent(num_place=3)
 

@@ -48,12 +48,14 @@ def untrained_teacher(untrained: Path, tmp_path: Path) -> Path:
 def make_student(untrained_teacher: Path, tmp_path: Path, module: Callable[[str], ModuleType]) -> Callable[..., Path]:
     """Write the run folder of an untrained student of the untrained teacher: ``make_student("name", byol=False)``."""
 
-    def make(name: str = "student", *, byol: bool = True, seed: int = 0, **changes: object) -> Path:
+    def make(
+        name: str = "student", *, byol: bool = True, seed: int = 0, own_estimator: bool = False, **changes: object
+    ) -> Path:
         torch.manual_seed(seed)
         teacher = Artifact.load(untrained_teacher / "policy")
         points = [[list(point) for point in kind.way_points] for kind in OBSTACLES.values()]
         sizes = {"memory": 16, "encoder_channels": (4, 8), "encoder_hidden": 8, "encoder_features": 8}
-        sizes |= {"heading_gate": 4.0, "glance_hidden": (8, 8)}
+        sizes |= {"heading_gate": 4.0, "glance_hidden": (8, 8), "estimator_history": own_estimator}
         network = RecurrentStudent(
             **teacher.manifest["network"], **sizes, way_points=points, routes=COURSES["bar_jump"].legs
         )

@@ -202,10 +202,11 @@ def test_a_glance_knows_how_sure_it_is(recipe: ModuleType, module: Module, smoke
 def test_imitation_of_one_window_lowers_its_loss(recipe: ModuleType, module: Module, smoke: Any) -> None:
     setup = module("tsc_student_setup")
     own = replace(smoke.imitation, minibatches=1, latent=None, augment=False, learning_rate=3e-3)
-    cfg = replace(smoke, byol=False, memory=64, encoder_features=32, precision="float32", imitation=own)
+    sizes = {"memory": 64, "encoder_features": 32, "estimator_history": False}
+    cfg = replace(smoke, byol=False, precision="float32", imitation=own, **sizes)
     parts = setup.build(*setup.resolve(cfg))
     window = parts.collector.collect()
-    losses = [recipe.imitate(parts, cfg, window, 0) for _ in range(30)]
+    losses = [recipe.imitate(parts, cfg, window, 0) for _ in range(80)]
     first, last = losses[0], losses[-1]
     assert parts.representation is None
     for name in ("loss_behaviour", "loss_parameters", "loss_obstacle", "loss_progress"):
@@ -224,17 +225,39 @@ def test_sixteen_bits_without_byol_from_another_student(recipe: ModuleType, smok
     assert "loss_byol" not in read_scalars(run) and "loss_behaviour" in read_scalars(run)
 
 
-def test_a_student_of_another_teacher_takes_this_ones_estimator(
-    recipe: ModuleType, smoke: Any, make_student: Callable[..., Path]
+@pytest.mark.parametrize("own", [False, True])
+def test_a_student_of_another_teacher_takes_this_ones_estimator_unless_it_has_its_own(
+    recipe: ModuleType, smoke: Any, make_student: Callable[..., Path], own: bool
 ) -> None:
     """It is not learned, and belongs to the controller below."""
-    other = Artifact.load(make_student("other"))
+    smoke = replace(smoke, estimator_history=own)
+    other = Artifact.load(make_student("other", own_estimator=own))
     state = {n: value + float(n.startswith(("estimator.", "memory."))) for n, value in other.state.items()}
     Artifact.save(other.folder, state, other.manifest)
     run = recipe.train(replace(smoke, name="child", init_from=other.folder, iterations=0))
     began, teacher = Artifact.load(run / "policy").state, Artifact.load(smoke.teacher / "policy").state
-    assert all(torch.equal(began[n], (teacher if n.startswith("estimator.") else state)[n]) for n in state)
+    inherited = teacher if not own else state
+    assert all(torch.equal(began[n], (inherited if n.startswith("estimator.") else state)[n]) for n in state)
     assert any(name.startswith("estimator.") for name in state)
+
+
+def test_an_estimator_of_its_own_learns_before_the_imitation(
+    recipe: ModuleType, smoke: Any, make_student: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A student without one goes on with one: all but that stays, and more steps on the same walk miss less."""
+    other = Artifact.load(make_student("other"))
+    errors = []
+    for epochs in (1, 40):
+        own = replace(smoke.estimation, robots=8, decisions=12, epochs=epochs, batch=12)
+        cfg = replace(smoke, name=f"own_{epochs}", init_from=other.folder, iterations=0, estimation=own)
+        artifact = Artifact.load(recipe.train(cfg) / "policy")
+        errors.append(float(capsys.readouterr().out.split("held out: ")[1].split()[0]))
+        assert artifact.manifest["network"]["estimator_history"] is True
+        kept = {n for n in other.state if not n.startswith("estimator.")}
+        assert all(torch.equal(artifact.state[n], other.state[n]) for n in kept)
+        first = artifact.state["estimator.module.layers.0.weight"]
+        assert first.shape == (128, 450)
+    assert errors[1] < 0.5 * errors[0]
 
 
 def test_a_student_commands_canters_as_fast_as_its_teacher(
