@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+FREEDOM = 9.0
+"""Degrees of freedom of Student's distribution in :func:`doubted`: three deviations off, something counts half."""
+
 
 def corrected(expected: Tensor, variance: Tensor, said: Tensor, unsure: Tensor) -> tuple[Tensor, Tensor]:
     r"""Where an obstacle is seen and the variance of that, after something was said of it, with how sure that is.
@@ -56,3 +59,33 @@ def credible(said: Tensor, expected: Tensor) -> Tensor:
     """
     distance = torch.linalg.vector_norm((said - expected)[..., :2].detach(), dim=-1, keepdim=True)
     return 1.0 / (1.0 + distance**4)
+
+
+def doubted(expected: Tensor, variance: Tensor, said: Tensor, unsure: Tensor) -> Tensor:
+    r"""Variance of something said of a place, larger the more it surprises: a wrong match claims to be as sure as a
+    right one.
+
+    .. math:: R' = R\,(1 + m^2 / 9), \qquad m^2 = \sum_{x, y} \frac{(m_i - \bar o_i)^2}{\bar P_i + R_i}
+
+    Who knows where he is is not led astray by one such match; who does not know has a large P, and is not surprised;
+    and what goes on being said is believed in the end.
+
+    Source: ours; the weight of an observation in Student's distribution (Lange et al. 1989,
+    doi:10.1080/01621459.1989.10478852), without its constant.
+
+    Args:
+        expected: ``[*B, 4]``, as :func:`corrected`, as are the next three.
+        variance: ``[*B, 3]``.
+        said: ``[*B, 4]``.
+        unsure: ``[*B, 3]``.
+
+    Returns:
+        ``[*B, 3]``; no gradient passes through the surprise.
+
+    Example:
+        >>> here, there = torch.tensor([2.0, 0.0, 0.0, 1.0]), torch.tensor([2.0, 0.3, 0.0, 1.0])
+        >>> doubted(here, torch.full((3,), 0.005), there, torch.full((3,), 0.005))  # three deviations off
+        tensor([0.0100, 0.0100, 0.0100])
+    """
+    off = (said - expected)[..., :2].square() / (variance + unsure)[..., :2]
+    return unsure * (1.0 + off.sum(-1, keepdim=True).detach() / FREEDOM)

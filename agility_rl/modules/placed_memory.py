@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from agility_rl.modules.distance_field import Solid
 from agility_rl.modules.glance import NUM_POSE, NUM_SCALES, Glance
-from agility_rl.modules.kalman import corrected
+from agility_rl.modules.kalman import corrected, doubted
 from agility_rl.modules.mlp import mlp
 from agility_rl.modules.planar import bearings, inverse, inverted, moved, planar_motion, seen_from, within
 from agility_rl.modules.preview import Preview, preview_parts
@@ -61,7 +61,8 @@ class PlacedMemory(nn.Module):
     :func:`~agility_rl.modules.planar.moved`); Q is what that adds in uncertainty. A
     :class:`~agility_rl.modules.glance.Glance` says where the obstacle ahead is seen and how sure that is, by which the
     pose is :func:`~agility_rl.modules.kalman.corrected`; then by where the shape of that type of obstacle fits what the
-    image measures, as far as it is in view (:class:`~agility_rl.modules.scan_matching.ScanMatcher`). A GRU, which sees
+    image measures, as far as it is in view (:class:`~agility_rl.modules.scan_matching.ScanMatcher`), the less the more
+    that surprises (:func:`~agility_rl.modules.kalman.doubted`). A GRU, which sees
     the feature, proprioception, what is expected of the place, and b, says how many images in a row count as one, and
     adds to what the glance says of terrain latent, obstacle and e.
 
@@ -249,7 +250,8 @@ class PlacedMemory(nn.Module):
         ahead, variance = corrected(ahead, variance, said, 2.0 * (2.0 * scale + alike + ALIKE).exp())
         measured = look, proprioception, estimate
         match = self._match(*measured, ahead, logits.argmax(-1))
-        ahead, variance = corrected(ahead, variance, *match.split((NUM_POSE, NUM_SCALES), -1))
+        fits, unsure = match.split((NUM_POSE, NUM_SCALES), -1)
+        ahead, variance = corrected(ahead, variance, fits, doubted(ahead, variance, fits, unsure))
         obstacle = inverted(ahead)
         pose = of_leg(within(obstacle, self.arena), leg)
         slot = of_leg(within(pose, self.legs), self.next_leg[leg]).detach()
