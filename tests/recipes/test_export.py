@@ -107,12 +107,12 @@ def test_a_student_is_exported_with_its_memory(
         "depth": [1, 58, 87],
         "proprioception": [1, 45],
         "history": [1, 10, 45],
-        "hidden": [1, 48],
+        "hidden": [1, 55],
     }
     assert artifact.manifest["camera"] == Artifact.load(run).manifest["camera"]
     generator = torch.Generator().manual_seed(7)
     networks = torch_student(artifact), onnx_student(artifact)
-    memories = [torch.zeros(1, 48), torch.zeros(1, 48)]
+    memories = [torch.zeros(1, 55), torch.zeros(1, 55)]
     for _ in range(20):  # the memory does not drift apart
         depth = torch.rand(1, 58, 87, generator=generator) - 0.5
         rest = [torch.randn(1, *shape, generator=generator) for shape in ((45,), (10, 45))]
