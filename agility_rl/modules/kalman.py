@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 FREEDOM = 9.0
-"""Degrees of freedom of Student's distribution in :func:`doubted`: three deviations off, something counts half."""
+"""Degrees of freedom of Student's distribution in :func:`doubted`: three deviations off, a variance counts twice."""
 
 
 def corrected(expected: Tensor, variance: Tensor, said: Tensor, unsure: Tensor) -> tuple[Tensor, Tensor]:
