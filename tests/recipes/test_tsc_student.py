@@ -200,13 +200,15 @@ def test_a_glance_knows_how_sure_it_is(recipe: ModuleType, module: Module, smoke
 
 
 def test_imitation_of_one_window_lowers_its_loss(recipe: ModuleType, module: Module, smoke: Any) -> None:
+    """On the full course: where there is one obstacle its type is known, and parameters are nearly right at once."""
     setup = module("tsc_student_setup")
     own = replace(smoke.imitation, minibatches=1, latent=None, augment=False, learning_rate=3e-3)
     sizes = {"memory": 64, "encoder_features": 32, "estimator_history": False}
-    cfg = replace(smoke, byol=False, precision="float32", imitation=own, **sizes)
+    env = replace(smoke.env, course="full")
+    cfg = replace(smoke, byol=False, precision="float32", imitation=own, env=env, seed=1, **sizes)
     parts = setup.build(*setup.resolve(cfg))
     window = parts.collector.collect()
-    losses = [recipe.imitate(parts, cfg, window, 0) for _ in range(80)]
+    losses = [recipe.imitate(parts, cfg, window, 0) for _ in range(30)]
     first, last = losses[0], losses[-1]
     assert parts.representation is None
     for name in ("loss_behaviour", "loss_parameters", "loss_obstacle", "loss_progress"):
