@@ -82,13 +82,13 @@ class RecurrentStudent(nn.Module):
             the place knows that too, but for the jitter.
         solids: ``[K][...]``, what every type of obstacle is made of; who infers the place and knows them matches them
             with what images measure.
-        estimator_history: whether the state estimator reads the history, and so is the student's own: its velocity is
-            what the way is counted by (ours). Else it is the teacher's, which reads the present alone.
-        stock: ``[K]``, how many obstacles of every type the course has (:attr:`agility_rl.envs.Course.stock`); who
-            infers the place and knows that takes none for of a type of which none is left.
+        stock: ``[K]``, how many obstacles of every type the course has (:attr:`agility_rl.envs.Course.stock`). Who
+            infers the place and knows that finds a type unlikely once all of it were met; without, no type is.
+        estimator_history: whether the state estimator reads the history (ours): then it is the student's own, and not
+            the teacher's, which reads the present alone. By its velocity the way is counted.
 
     Raises:
-        ValueError: if ``num_place`` is another number, or obstacles lack way-points or solids.
+        ValueError: if ``num_place`` is another number, or way-points, solids or stock are those of too few types.
 
     Example:
         >>> from tensordict import TensorDict
@@ -179,7 +179,9 @@ class RecurrentStudent(nn.Module):
 
     @classmethod
     def from_teacher(cls, teacher: Teacher, **options: Any) -> RecurrentStudent:
-        """A student with a teacher's sizes and copies of its actor, history encoder and estimator, but its own."""
+        """A student with a teacher's sizes and copies of its actor and history encoder, and of its estimator unless the
+        student has one of its own.
+        """
         student = cls(**teacher.settings, **options)
         own_estimator = student.settings["estimator_history"]
         for name in ("actor", "history_encoder", *([] if own_estimator else ["estimator"])):
