@@ -77,7 +77,8 @@ def collect(cfg: Config) -> TensorDictBase:
     """Walk and look: :func:`glances.asked`, ``[T, N]``."""
     learner = load_trained(cfg.student, "student")
     student = learner.network.settings
-    sizes = ("memory", "encoder_channels", "encoder_hidden", "encoder_features", "glance_hidden", "heading_gate")
+    encoder = ("encoder_channels", "encoder_hidden", "encoder_features", "glance_hidden")
+    own = ("memory", *encoder, "heading_gate", "estimator_history")
     robots = ("course", "num_robots", "num_threads", "start_spread", "start_after", "episode_length")
     run, trained = resolve(
         replace(
@@ -87,7 +88,7 @@ def collect(cfg: Config) -> TensorDictBase:
             init_from=cfg.student,
             seed=cfg.seed,
             env=replace(CPU.env, **{name: getattr(cfg, name) for name in robots}),
-            **{name: student[name] for name in sizes if name in student},
+            **{name: student[name] for name in own if name in student},
         )
     )
     if learner.artifact.manifest["teacher"] != trained.digest:

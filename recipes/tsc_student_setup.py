@@ -250,7 +250,7 @@ def load_student(parts: Components, path: Path, kept: tuple[str, ...]) -> bool:
     trained = load_trained(path, "student")
     # A student is told what to do and draws nothing: what its teacher's deviations were makes no difference. How often
     # it decides is this run's: it only counts its way by it; and what obstacles are made of, and how many of each type
-    # there are, is no matter of weights.
+    # there are, is no matter of weights. An estimator of another kind stays behind.
     ignored = ("initial_std", "min_std", "period", "solids", "stock", "estimator_history")
     own, wanted = trained.network.settings, parts.student.settings
     differ = [name for name in wanted if name not in ignored and own.get(name) != wanted[name]]

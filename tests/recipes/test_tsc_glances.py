@@ -73,6 +73,20 @@ def test_images_of_short_episodes_show_where_they_start(
     assert not torch.equal(along[0], along[10])
 
 
+@pytest.mark.parametrize("own", [False, True])
+def test_a_student_walks_by_its_own_estimator_or_its_teachers(
+    module: Module, student: Any, make_student: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, own: bool
+) -> None:
+    recipe, built = module("tsc_images"), []
+    monkeypatch.setattr(recipe, "build", lambda *given, build=recipe.build: built.append(build(*given)) or built[-1])
+    path = make_student("walker", own_estimator=own)
+    options = {"student": path, "teacher": student.teacher, "bbc": student.bbc, "runs": student.runs}
+    recipe.main(recipe.Config(**options, windows=1, num_robots=2))
+    walked, has = built[0].student.state_dict(), Artifact.load((path if own else student.teacher) / "policy").state
+    names = [name for name in has if name.startswith("estimator.")]
+    assert names and all(torch.equal(walked[name], has[name]) for name in names)
+
+
 def options_of(folder: Path, **others: Any) -> dict[str, Any]:
     given = {"images": (folder / "images",), "student": folder / "student", "runs": folder, "batch": 8}
     return given | {"minutes": 0.002} | others
