@@ -52,7 +52,7 @@ def waits() -> Iterator[Counter[str]]:
     places: Counter[str] = Counter()
 
     def note(message: Warning | str, *where: Any, **options: Any) -> None:
-        if "synchronizing" in str(message):
+        if "called a synchronizing" in str(message):
             frames = traceback.extract_stack()[:-1]
             ours = [frame for frame in frames if set(OURS) & set(Path(frame.filename).parts)] or frames
             places[f"{Path(ours[-1].filename).name}:{ours[-1].lineno} {ours[-1].line}"] += 1

@@ -143,7 +143,7 @@ class Preview(nn.Module):
         # An exported network cannot choose rows; elsewhere most are spared K fits.
         every = torch.arange(len(visible), device=visible.device)
         rows = every if torch.compiler.is_exporting() else every[visible]
-        measured = [part[rows] for part in (depth, proprioception, estimate, expected)]
+        measured = [part[rows] for part in (depth, proprioception, estimate, expected, inverted(at_slot))]
         matches, share = matcher.compare(*measured)
         evidence = EVIDENCE * share
         likeliest = ((self.hints(memory)[0] + likely)[rows] + evidence).argmax(-1)

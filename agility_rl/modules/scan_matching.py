@@ -28,6 +28,9 @@ ABOVE, BELOW = 0.06, 1.6
 AROUND = (2.3, 1.1)
 """So far along and across where the middle of an obstacle is expected they lie at most [m]: what stands beside it in
 the course begins 1.2 m from there."""
+ABOUT_SLOT = (2.0, 0.9)
+"""So far from a slot of the course, where that of an obstacle not met yet is known only: a wall runs 1.2 m beside some,
+and where those are believed 0.2 m aside, a tunnel would be found in it (docs/student.md)."""
 STEPS = 4
 """Of Gauss and Newton."""
 WIDTH = (0.1, 0.04)
@@ -132,6 +135,7 @@ class ScanMatcher(nn.Module):
     floor: Tensor
     held: Tensor
     around: Tensor
+    about_slot: Tensor
     aside: Tensor
     turns: Tensor
 
@@ -149,6 +153,7 @@ class ScanMatcher(nn.Module):
             "floor": torch.tensor(FLOOR),
             "held": torch.tensor(HELD),
             "around": torch.tensor(AROUND),
+            "about_slot": torch.tensor(ABOUT_SLOT),
             "aside": ASIDE * torch.tensor([0.0, 1.0, -1.0])[:, None, None] * torch.eye(len(EXPECTED))[1],
             "turns": torch.stack((torch.eye(3).double().expand(3, -1, -1), cross, cross @ cross)),
         }.items():
@@ -170,12 +175,12 @@ class ScanMatcher(nn.Module):
         Returns:
             ``[N, 7]``: as ``expected``, and variances of x, y [m^2] and yaw [rad^2], :data:`NOTHING` without a match.
         """
-        scan = self._scan(depth, proprioception, estimate, expected, (RAISED, GROUND))
+        scan = self._scan(depth, proprioception, estimate, expected, (expected, self.around), (RAISED, GROUND))
         return self._matches(scan, kind)[0]
 
     @torch.no_grad()
     def compare(
-        self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor
+        self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor, slot: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Where an obstacle is seen if it is of each type, and how much of what stands there that explains.
 
@@ -184,12 +189,13 @@ class ScanMatcher(nn.Module):
             proprioception: ``[N, 45]``.
             estimate: ``[N, 4]``.
             expected: ``[N, 4]``.
+            slot: where its place in the course is, about which it may stand, as ``expected``.
 
         Returns:
             Matches ``[N, K, 7]``, as :meth:`forward`; share of the raised points, less where they are few, ``[N, K]``.
         """
         count = self.field.count
-        scan = self._scan(depth, proprioception, estimate, expected, (COMPARED, GROUND))
+        scan = self._scan(depth, proprioception, estimate, expected, (slot, self.about_slot), (COMPARED, GROUND))
         kinds = torch.arange(count, device=depth.device).repeat_interleave(len(depth))
         matches, fit = self._matches(_repeated(scan, count), kinds)
         enough = (fit.there / MANY).clamp(max=1.0) * (fit.there >= FEW)
@@ -215,10 +221,11 @@ class ScanMatcher(nn.Module):
         proprioception: Tensor,
         estimate: Tensor,
         expected: Tensor,
+        window: tuple[Tensor, Tensor],
         most: tuple[int, int],
     ) -> _Scan:
-        """At most so many points above the ground and on it, about where the obstacle is expected."""
-        expected = on_grid(expected)
+        """At most so many points above the ground and on it, about a place that the robot sees there, and so far."""
+        expected, middle = on_grid(expected), on_grid(window[0])
         motion = LATENCY * planar_motion(proprioception, estimate)
         roll_pitch, rates = attitude(proprioception)
         roll, pitch = (roll_pitch - LATENCY * rates[..., :2]).unbind(-1)
@@ -229,8 +236,8 @@ class ScanMatcher(nn.Module):
         points = metres[..., None] * self.rays + self.mount
         up = torch.stack((-pitch.sin(), pitch.cos() * roll.sin(), pitch.cos() * roll.cos()), -1)
         above = (points @ up[..., None])[..., 0] + height[:, None]
-        about = seen_from(inverted(robot), points[..., :2]).abs()
-        measured = (metres > NEAREST) & (metres < FARTHEST) & (about < self.around).all(-1)
+        about = seen_from(inverted(moved(inverted(middle), -motion)), points[..., :2]).abs()
+        measured = (metres > NEAREST) & (metres < FARTHEST) & (about < window[1]).all(-1)
         raised = (above > ABOVE) & (above < BELOW)
         chosen = [
             (self.order + (measured & these)).topk(count, -1).indices

@@ -12,7 +12,7 @@ from agility_rl.modules.preview import ALIKE, EVIDENCE, NEXT, STRONGEST, VIEW_AN
 from agility_rl.modules.scan_matching import FLOOR, NOTHING, ScanMatcher
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0)
-BLOCK, PEBBLE = (("box", size, (0.0, 0.0, size[2]), *UPRIGHT) for size in ((0.4, 1.0, 0.8), (0.02, 0.02, 0.02)))
+BLOCK, PEBBLE = (("box", size, (0.0, 0.0, size[2]), *UPRIGHT) for size in ((0.4, 0.8, 0.8), (0.02, 0.02, 0.02)))
 STANDING = torch.tensor([[0.27, 0.0, 0.0, 0.0]])
 
 

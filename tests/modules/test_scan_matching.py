@@ -196,9 +196,9 @@ def test_what_only_rounding_tells_apart_is_matched_alike(matcher: ScanMatcher) -
     measured, seen, kind = standing("weave_poles", 1.0)
     inputs = (*measured, on_grid(beside(seen)))
     nearly = (*measured, inputs[-1] * (1.0 + 1e-6))
-    compared, matched = matcher.compare(*inputs), matcher(*inputs, kind)
+    compared, matched = matcher.compare(*inputs, inputs[-1]), matcher(*inputs, kind)
     for row in range(ROBOTS):
-        alone = matcher.compare(*(values[row : row + 1] for values in nearly))
+        alone = matcher.compare(*(values[row : row + 1] for values in (*nearly, nearly[-1])))
         for values, together in zip(alone, compared, strict=True):
             torch.testing.assert_close(values[0], together[row], rtol=1e-6, atol=1e-6)
         alone_matched = matcher(*(values[row : row + 1] for values in (*nearly, kind)))
@@ -210,7 +210,7 @@ def test_an_obstacle_is_told_from_others_by_its_shape(matcher: ScanMatcher, name
     """Of most robots before it, with all errors of the camera."""
     measured, seen, kind = standing(name, 1.0)
     expected = beside(seen)
-    matches, share = matcher.compare(*measured, expected)
+    matches, share = matcher.compare(*measured, expected, expected)
     assert share.shape == (ROBOTS, len(SOLIDS)) and ((share >= 0.0) & (share <= 1.0)).all()
     assert (share.argmax(-1) == kind).float().mean() > 0.8
     assert matches.shape == (ROBOTS, len(SOLIDS), 7)
@@ -222,7 +222,19 @@ def test_what_stands_beside_says_nothing_of_the_type(matcher: ScanMatcher) -> No
     """A tunnel in view, an obstacle expected 2 m to its left."""
     measured, seen, _ = standing("tunnel", walls=False)
     beside_it = seen + torch.tensor([0.0, 2.0, 0.0, 0.0])
-    assert (matcher.compare(*measured, beside_it)[1] == 0.0).all()
+    assert (matcher.compare(*measured, beside_it, beside_it)[1] == 0.0).all()
+
+
+@pytest.mark.parametrize(("aside", "counts"), [(0.8, True), (1.0, False)])
+def test_a_wall_is_not_taken_for_what_a_slot_holds(matcher: ScanMatcher, aside: float, counts: bool) -> None:
+    """It runs along the way, so far to its right; the obstacle is believed to stand there, its slot is straight on."""
+    rays = camera.pixel_directions()
+    ground = (0.27 + camera.POSITION[2]) / (-rays[..., 2]).clamp(min=1e-6)
+    wall = (aside + camera.POSITION[1]) / (-rays[..., 1]).clamp(min=1e-6)
+    measured = camera.normalize_depth(torch.minimum(ground, wall))[None], torch.zeros(1, 45)
+    height, slot = torch.tensor([[0.27, 0.0, 0.0, 0.0]]), torch.tensor([[2.5, 0.0, 0.0, 1.0]])
+    _, share = matcher.compare(*measured, height, slot - torch.tensor([0.0, 0.6, 0.0, 0.0]), slot)
+    assert bool((share > 0.2).any()) is counts and (counts or not share.any())
 
 
 @pytest.mark.parametrize("name", ["tire_jump", "a_frame", "tunnel"])
