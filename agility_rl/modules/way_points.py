@@ -69,10 +69,11 @@ def told_of(belief: Tensor, evidence: Tensor, possible: Tensor) -> Tensor:
 def reached(offset: Tensor) -> Tensor:
     r"""How much speaks for it that a way-point is reached, as a logit: it is near, or just behind.
 
-    .. math:: \max\left(0.42 - d,\ \min(-x - 0.15,\ 0.5 - |y|)\right) / 0.02 \quad \text{within} \pm 8
+    .. math:: \max\left(0.42 - d,\ \min(-x - 0.15,\ 0.4 - |y|)\right) / 0.02 \quad \text{within} \pm 8
 
     The radius is 0.45 m (method notes, section 5.5); a little less, since belief begins to go over before. A way-point
-    that is passed should have been reached.
+    that is 0.15 m behind and less than 0.4 m aside was within it a moment ago. Who has passed one farther aside has to
+    go back to it.
 
     Source: ours.
 
@@ -83,12 +84,12 @@ def reached(offset: Tensor) -> Tensor:
         ``[*B]``, without gradient.
 
     Example:
-        >>> reached(torch.tensor([[0.0, 0.4], [0.45, 0.0], [-0.17, 0.45], [-3.0, 0.9]])).round(decimals=3)
+        >>> reached(torch.tensor([[0.0, 0.4], [0.45, 0.0], [-0.17, 0.38], [-3.0, 0.9]])).round(decimals=3)
         tensor([ 1.0000, -1.5000,  1.0000, -8.0000])
     """
     offset = offset.detach()
     near = NEAR - torch.linalg.vector_norm(offset, dim=-1)
-    behind = torch.minimum(-offset[..., 0] - 0.15, 0.5 - offset[..., 1].abs())
+    behind = torch.minimum(-offset[..., 0] - 0.15, 0.4 - offset[..., 1].abs())
     return (torch.maximum(near, behind) / 0.02).clamp(-8.0, 8.0)
 
 

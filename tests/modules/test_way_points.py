@@ -23,6 +23,13 @@ def test_edges_of_what_lies_straight_ahead(logit: Callable[[Tensor], Tensor], ed
     assert not logit(offset).requires_grad
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_way_point_that_was_passed_is_reached_if_it_was_near(side: float) -> None:
+    """0.15 m behind is where one 0.4 m aside is 0.427 m away, so within the 0.45 m that count; 0.45 m aside none was."""
+    offset = torch.tensor([[-0.17, 0.38], [-0.6, 0.38], [-0.17, 0.42], [-0.6, 0.45]]) * torch.tensor([1.0, side])
+    assert (reached(offset) > 0.0).tolist() == [True, True, False, False]
+
+
 def test_belief_is_only_shifted() -> None:
     generator = torch.Generator().manual_seed(0)
     belief, logit = torch.rand(5, 6, generator=generator), torch.randn(5, 6, generator=generator)
