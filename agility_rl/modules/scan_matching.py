@@ -29,8 +29,9 @@ AROUND = (2.3, 1.1)
 """So far along and across where the middle of an obstacle is expected they lie at most [m]: what stands beside it in
 the course begins 1.2 m from there."""
 ABOUT_SLOT = (2.0, 0.9)
-"""So far from a slot of the course, where that of an obstacle not met yet is known only: a wall runs 1.2 m beside some,
-and where those are believed 0.2 m aside, a tunnel would be found in it (docs/student.md)."""
+"""So far from a slot of the course, which is all that is known of where an obstacle stands that was not met yet [m].
+It is seen from the one before, 4 m off, which stands up to 0.25 m aside and 0.087 rad turned (method notes, section
+5.7): from there a wall 1.5 m beside a slot may be as near as 0.9 m, and a tunnel would be found in it."""
 STEPS = 4
 """Of Gauss and Newton."""
 WIDTH = (0.1, 0.04)
