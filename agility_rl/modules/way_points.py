@@ -5,10 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-RADIUS = 0.45
-"""Distance at which a way-point is reached [m]: a student's (method notes, section 5.5)."""
 NEAR = 0.42
-"""Distance at which one ahead is taken for reached [m]; see :func:`reached`."""
+"""Distance at which a way-point is taken for reached [m]; see :func:`reached`."""
 FAR = 0.58
 """Distance at which one ahead is not reached [m]; see :func:`to_come`."""
 
@@ -71,11 +69,11 @@ def told_of(belief: Tensor, evidence: Tensor, possible: Tensor) -> Tensor:
 def reached(offset: Tensor) -> Tensor:
     r"""How much speaks for it that a way-point is reached, as a logit: it is near, or just behind.
 
-    .. math:: \max\left(0.42 - d,\ \min(-x - 0.15,\ \max(0.45 - d,\ 0.3 - |y|))\right) / 0.02 \quad \text{within} \pm 8
+    .. math:: \max\left(0.42 - d,\ \min(-x - 0.15,\ 0.4 - |y|)\right) / 0.02 \quad \text{within} \pm 8
 
-    The radius is 0.45 m (method notes, section 5.5); a little less of one ahead, since belief begins to go over before.
-    Who has passed one less than 0.3 m aside was within it, however far that is behind; who comes out of a turn farther
-    beside it has to go back.
+    The radius is 0.45 m (method notes, section 5.5); a little less, since belief begins to go over before. A way-point
+    that is 0.15 m behind and less than 0.4 m aside was within it a moment ago, where it was passed straight on. Who has
+    passed one farther aside has to go back to it.
 
     Source: ours.
 
@@ -86,14 +84,13 @@ def reached(offset: Tensor) -> Tensor:
         ``[*B]``, without gradient.
 
     Example:
-        >>> reached(torch.tensor([[0.0, 0.4], [0.45, 0.0], [-0.17, 0.38], [-0.4, 0.38], [-3.0, 0.9]])).round(decimals=3)
-        tensor([ 1.0000, -1.5000,  1.0000, -4.0000, -8.0000])
+        >>> reached(torch.tensor([[0.0, 0.4], [0.45, 0.0], [-0.17, 0.38], [-3.0, 0.9]])).round(decimals=3)
+        tensor([ 1.0000, -1.5000,  1.0000, -8.0000])
     """
     offset = offset.detach()
-    distance = torch.linalg.vector_norm(offset, dim=-1)
-    passed = torch.maximum(RADIUS - distance, 0.3 - offset[..., 1].abs())
-    behind = torch.minimum(-offset[..., 0] - 0.15, passed)
-    return (torch.maximum(NEAR - distance, behind) / 0.02).clamp(-8.0, 8.0)
+    near = NEAR - torch.linalg.vector_norm(offset, dim=-1)
+    behind = torch.minimum(-offset[..., 0] - 0.15, 0.4 - offset[..., 1].abs())
+    return (torch.maximum(near, behind) / 0.02).clamp(-8.0, 8.0)
 
 
 def to_come(offset: Tensor) -> Tensor:

@@ -24,11 +24,10 @@ def test_edges_of_what_lies_straight_ahead(logit: Callable[[Tensor], Tensor], ed
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_way_point_behind_is_reached_if_it_was_near(side: float) -> None:
-    """0.444 m away is within the 0.45 m that count, 0.463 m is not; one 0.25 m aside was within them, one 0.38 m aside
-    need not have been, since turns end beside it."""
-    offset = torch.tensor([[-0.17, 0.41], [-0.25, 0.39], [-0.6, 0.25], [-0.6, 0.38]]) * torch.tensor([1.0, side])
-    assert (reached(offset) > 0.0).tolist() == [True, False, True, False]
+def test_a_way_point_that_was_passed_is_reached_if_it_was_near(side: float) -> None:
+    """One 0.15 m behind and 0.4 m aside is 0.427 m away, within the 0.45 m that count; 0.45 m aside none was."""
+    offset = torch.tensor([[-0.17, 0.38], [-0.6, 0.38], [-0.17, 0.42], [-0.6, 0.45]]) * torch.tensor([1.0, side])
+    assert (reached(offset) > 0.0).tolist() == [True, True, False, False]
 
 
 def test_belief_is_only_shifted() -> None:
