@@ -262,9 +262,10 @@ def test_who_goes_back_knows_nothing_of_the_obstacle_before() -> None:
 
 @torch.no_grad()
 def test_a_way_point_counts_until_it_is_reached() -> None:
-    """The second way-point is at x = -0.5, and only where it is the present one is it passed."""
+    """The second way-point is at x = -0.5, and is passed only where it is the present one, and not far beside it."""
     memory, _ = silent((FIRST, STRAIGHT))
-    for x, y, done in ((-1.5, 0.0, 0.0), (-0.92, 0.0, 0.5), (-0.8, 0.4, 0.0), (-0.5, 0.1, 1.0), (-0.2, 0.4, 1.0)):
+    ways = (-1.5, 0.0, 0.0), (-0.92, 0.0, 0.5), (-0.8, 0.4, 0.0), (-0.5, 0.1, 1.0), (-0.2, 0.3, 1.0), (-0.2, 0.5, 0.0)
+    for x, y, done in ways:
         *_, progress, _ = memory.step(*still(memory, [2.0 + x, 3.0 + y, 0.0, 1.0], 1))
         assert float(progress.exp()[0, 2]) == pytest.approx(done, abs=0.02)
         assert float(progress.exp()[0, 1]) == pytest.approx(1.0 - done, abs=0.02)
