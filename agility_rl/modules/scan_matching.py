@@ -176,7 +176,7 @@ class ScanMatcher(nn.Module):
         Returns:
             ``[N, 7]``: as ``expected``, and variances of x, y [m^2] and yaw [rad^2], :data:`NOTHING` without a match.
         """
-        scan = self._scan(depth, proprioception, estimate, expected, (expected, self.around), (RAISED, GROUND))
+        scan = self._scan(depth, proprioception, estimate, expected, None, (RAISED, GROUND))
         return self._matches(scan, kind)[0]
 
     @torch.no_grad()
@@ -190,13 +190,13 @@ class ScanMatcher(nn.Module):
             proprioception: ``[N, 45]``.
             estimate: ``[N, 4]``.
             expected: ``[N, 4]``.
-            slot: where its place in the course is, about which it may stand, as ``expected``.
+            slot: ``[N, 4]``, as ``expected``: its place in the course, about which it may stand.
 
         Returns:
             Matches ``[N, K, 7]``, as :meth:`forward`; share of the raised points, less where they are few, ``[N, K]``.
         """
         count = self.field.count
-        scan = self._scan(depth, proprioception, estimate, expected, (slot, self.about_slot), (COMPARED, GROUND))
+        scan = self._scan(depth, proprioception, estimate, expected, slot, (COMPARED, GROUND))
         kinds = torch.arange(count, device=depth.device).repeat_interleave(len(depth))
         matches, fit = self._matches(_repeated(scan, count), kinds)
         enough = (fit.there / MANY).clamp(max=1.0) * (fit.there >= FEW)
@@ -222,23 +222,24 @@ class ScanMatcher(nn.Module):
         proprioception: Tensor,
         estimate: Tensor,
         expected: Tensor,
-        window: tuple[Tensor, Tensor],
+        slot: Tensor | None,
         most: tuple[int, int],
     ) -> _Scan:
-        """At most so many points above the ground and on it, about a place that the robot sees there, and so far."""
-        expected, middle = on_grid(expected), on_grid(window[0])
+        """At most so many points above the ground and on it, about the slot, or else where the obstacle is expected."""
         motion = LATENCY * planar_motion(proprioception, estimate)
         roll_pitch, rates = attitude(proprioception)
         roll, pitch = (roll_pitch - LATENCY * rates[..., :2]).unbind(-1)
-        robot = moved(inverted(expected), -motion)
+        robot = moved(inverted(on_grid(expected)), -motion)
+        middle = robot if slot is None else moved(inverted(on_grid(slot)), -motion)
+        window = self.around if slot is None else self.about_slot
         height, yaw = estimate[:, 0], torch.atan2(robot[:, 2], robot[:, 3])
         start = torch.stack((robot[:, 0], robot[:, 1], height, yaw, pitch, roll, torch.zeros_like(roll)), -1)
         metres = camera.metres(depth).flatten(1)
         points = metres[..., None] * self.rays + self.mount
         up = torch.stack((-pitch.sin(), pitch.cos() * roll.sin(), pitch.cos() * roll.cos()), -1)
         above = (points @ up[..., None])[..., 0] + height[:, None]
-        about = seen_from(inverted(moved(inverted(middle), -motion)), points[..., :2]).abs()
-        measured = (metres > NEAREST) & (metres < FARTHEST) & (about < window[1]).all(-1)
+        about = seen_from(inverted(middle), points[..., :2]).abs()
+        measured = (metres > NEAREST) & (metres < FARTHEST) & (about < window).all(-1)
         raised = (above > ABOVE) & (above < BELOW)
         chosen = [
             (self.order + (measured & these)).topk(count, -1).indices
