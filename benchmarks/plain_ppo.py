@@ -353,6 +353,7 @@ def main() -> None:
     parser.add_argument("--start", type=int, default=400, help="first iteration; by then all ramps are over")
     parser.add_argument("--robots", type=int, help="another number of robots")
     parser.add_argument("--bfloat16", action="store_true", help="plain loop: autocast actor and critic")
+    parser.add_argument("--compile", action="store_true", help="recipe: --ppo.compile")
     parser.add_argument("--only", choices=("plain", "recipe"), help="run one of the two")
     parser.add_argument("--labelled", type=Path, help="folder of labelled clips; synthetic gaits without it")
     parser.add_argument("--unlabelled", type=Path, help="folder of unlabelled clips")
@@ -360,6 +361,7 @@ def main() -> None:
     recipe = load_recipe()
     cfg = recipe.PRESETS[options.preset]
     cfg = replace(cfg, motion=replace(cfg.motion, labelled=options.labelled, unlabelled=options.unlabelled))
+    cfg = replace(cfg, ppo=replace(cfg.ppo, compile=options.compile))
     if options.robots:
         cfg = replace(cfg, env=replace(cfg.env, num_robots=options.robots))
 

@@ -140,7 +140,8 @@ class PPOConfig:
     precision: Precision = "float32"
     """Of the hidden layers in the update; ``auto`` is bfloat16 on hardware that multiplies in it."""
     compile: bool = False
-    """Fuse PPO's loss by ``torch.compile``: a minute once, then a faster update (docs/gpu.md)."""
+    """Fuse PPO's loss, and policy and critic of roll-outs, by ``torch.compile``: a minute once, then faster
+    (docs/gpu.md)."""
     averaging: float = 0.0
     """What is saved is a moving average of the controller's weights with this decay an iteration, so that less hangs on
     which iteration was the last; 0: the last weights. Ours (docs/bbc.md, The rhythm)."""

@@ -172,6 +172,7 @@ def build(cfg: Config) -> Components:
         ],
         keep_next=["reward", keys.MOTION, keys.REWARD_TERMS],
         value=lambda observation: critic(observation.select(*critic_keys))["state_value"],
+        compile=ppo.compile,
     )
     return Components(
         seeds=seeds,

@@ -124,6 +124,7 @@ def make_learner(
             keep=[*dict.fromkeys([*OBSERVED, *keep, keys.ACTION, *said])],
             keep_next=["reward", *outcome],
             value=lambda observation: critic(observation.select(*OBSERVED))["state_value"],
+            compile=ppo.compile,
         ),
         noise=noise,
         advantage=GAE(gamma=ppo.gamma, lmbda=ppo.lmbda, value_network=None, time_dim=0),

@@ -33,7 +33,8 @@ class Glance(nn.Module):
         known: numbers of terrain latent, obstacle and progress.
         legs: obstacles of the course.
         hidden: units of the layers between the feature with an expected place and the correction; where an obstacle
-            stands from there is a turn and a shift, which several layers say much better than one (docs/student.md).
+            stands from there is a turn and a shift, which several layers say much better than one
+            (docs/student_limits.md).
 
     Example:
         >>> glance = Glance(32, (32, 7, 24), legs=6)

@@ -96,7 +96,7 @@ class PPOUpdate:
         compile: bool = False,
     ) -> None:
         self.loss = loss
-        self._losses: Callable[[TensorDictBase], TensorDictBase] = torch.compile(loss) if compile else loss
+        self._losses: Callable[[TensorDictBase], TensorDictBase] = torch.compile(loss, disable=not compile)
         self.optimizer = optimizer
         self.epochs = epochs
         self.minibatches = minibatches

@@ -26,6 +26,8 @@ class Rollout:
         keep: root entries to store (observations, actions, log-probabilities).
         keep_next: entries of the next state to store, e.g. reward and discriminator frames.
         value: callable that maps a TensorDict of observations to values ``[*B, 1]``.
+        compile: fuse policy and value by ``torch.compile``, which takes half a minute at the first step and needs a
+            C++ compiler on a CPU; numbers differ by rounding, and random ones are others, as sure to come again.
 
     Raises:
         ValueError: if the environment has no batch dimension.
@@ -39,6 +41,7 @@ class Rollout:
         keep: Sequence[NestedKey],
         keep_next: Sequence[NestedKey],
         value: Callable[[TensorDictBase], Tensor],
+        compile: bool = False,
     ) -> None:
         if len(env.batch_size) != 1:
             raise ValueError(f"expected an environment with batch_size [N], got {list(env.batch_size)}")
@@ -47,6 +50,7 @@ class Rollout:
         self.keep = list(keep)
         self.keep_next = [*keep_next, "done", "terminated", "truncated"]
         self.value = value
+        self.compile = compile
         self.carrier: TensorDictBase | None = None
         self._storage: TensorDictBase | None = None
         self._last_done: Tensor
@@ -60,9 +64,11 @@ class Rollout:
             memory is reused by the next call.
         """
         carrier = self.env.reset() if self.carrier is None else self.carrier
+        # One policy after another is built of the same parts: what was compiled for the first serves them all.
+        act, judge = (torch.compile(call, disable=not self.compile) for call in (policy, self.value))
         for step in range(self.num_steps):
-            carrier = policy(carrier)
-            value = self.value(carrier)
+            carrier = act(carrier)
+            value = judge(carrier)
             full, upcoming = self.env.step_and_maybe_reset(carrier)
             row = full.select(*self.keep)
             row["state_value"] = value
@@ -81,7 +87,7 @@ class Rollout:
             carrier = upcoming
         assert self._storage is not None
         self.carrier = carrier
-        final = self.value(carrier)
+        final = judge(carrier)
         self._storage["next", "state_value"][-1] += final.masked_fill(self._last_done, 0.0)
         return self._storage
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import InteractionType, TensorDictSequential, set_interaction_type
 from torch import Tensor
 from torchrl.objectives.value import GAE
 
 from agility_rl import keys
 from agility_rl.envs import LocomotionEnv
+from agility_rl.modules import Critic, GaussianActor
 from agility_rl.training.rollout import Rollout
 
 N, T = 4, 12
@@ -144,6 +147,35 @@ def test_resume_goes_on_exactly(build: Build) -> None:
     batch = other.collect(policy)
     for name, entry in expected.items(include_nested=True, leaves_only=True):
         assert torch.equal(entry, batch[name]), name
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # torch's compiler, of torch itself
+def test_a_compiled_roll_out_is_the_eager_one_but_for_rounding_and_its_draws(build: Build) -> None:
+    """Without draws it sees the same; with them actions are the Gaussian's, have its density, and come again."""
+    torch.manual_seed(0)
+    actor = GaussianActor(45 + 11, in_keys=[keys.PROPRIOCEPTION, keys.COMMAND], hidden=(32,), initial_std=0.3)
+    critic = Critic(45 + 450, in_keys=[keys.PROPRIOCEPTION, keys.HISTORY], hidden=(32,))
+
+    def collect(compile: bool, times: int, seed: int = 0) -> TensorDictBase:
+        keep = [keys.PROPRIOCEPTION, keys.ACTION, "loc", "scale", "action_log_prob"]
+        worth = lambda td: critic(td.select(*critic.in_keys))["state_value"]  # noqa: E731
+        made = Rollout(build(seed=4), T, keep=keep, keep_next=["reward"], value=worth, compile=compile)
+        torch.manual_seed(seed)
+        return torch.cat([made.collect(TensorDictSequential(actor)).clone() for _ in range(times)])
+
+    with set_interaction_type(InteractionType.DETERMINISTIC):
+        eager, compiled = collect(False, 2), collect(True, 2)
+    assert eager["next", "truncated"].any()
+    for name, entry in eager.items(include_nested=True, leaves_only=True):
+        torch.testing.assert_close(compiled[name], entry, atol=2e-3, rtol=2e-3, msg=str(name))
+    first, again, other = collect(True, 10, 1), collect(True, 10, 1), collect(True, 10, 2)
+    assert torch.equal(first[keys.ACTION], again[keys.ACTION])
+    assert not torch.equal(first[keys.ACTION], other[keys.ACTION])
+    drawn = (first[keys.ACTION] - first["loc"]) / first["scale"]
+    assert abs(drawn.mean()) < 0.06 and abs(drawn.std() - 1.0) < 0.04  # four deviations of 5,760 numbers
+    by_hand = (-0.5 * drawn.square() - first["scale"].log() - 0.5 * math.log(2.0 * math.pi)).sum(-1)
+    torch.testing.assert_close(first["action_log_prob"], by_hand, atol=1e-4, rtol=1e-4)
 
 
 def test_before_the_first_call_there_is_nothing_to_save(build: Build) -> None:
