@@ -144,7 +144,7 @@ class PPOConfig:
     (docs/gpu.md)."""
     averaging: float = 0.0
     """What is saved is a moving average of the controller's weights with this decay an iteration, so that less hangs on
-    which iteration was the last; 0: the last weights. Ours (docs/bbc.md, The rhythm)."""
+    which iteration was the last; 0: the last weights. Ours (docs/bbc_experiments.md, The rhythm)."""
     by_behaviour: bool = False
     """Normalise advantages within each behaviour (ours); over all of them, one that is paid more is learned at the
     others' expense."""
@@ -245,7 +245,7 @@ class AdaptationConfig:
 class TrialsConfig:
     start: int | None = None
     """Iteration after which the controller is first measured as ``evaluate.py`` does; what the run shows is then the
-    best one that was, not the last. Never when not given. Ours (docs/bbc.md, Trials)."""
+    best one that was, not the last. Never when not given. Ours (docs/bbc_experiments.md, Trials)."""
     every: int = 25
     """Iterations between two trials, of which one takes about as long as ten iterations."""
     episodes: int = 100

@@ -1,8 +1,8 @@
 """Trials during a training: what the controller of the moment does, and which one the run shows in the end.
 
-Between two checkpoints behaviours come and go (``docs/bbc.md``, Trials), and neither a reward nor a loss tells.
-So from an iteration on the controller is measured every so often as ``evaluate.py`` does, with a seed that nobody else
-uses, and ``policy/`` holds the best of those that were.
+Between two checkpoints behaviours come and go (``docs/bbc_experiments.md``, Trials), and neither a reward nor a loss
+tells. So from an iteration on the controller is measured every so often as ``evaluate.py`` does, with a seed that
+nobody else uses, and ``policy/`` holds the best of those that were.
 
 Out: ``RUN/trials/ITERATION/`` with ``policy/``, ``discriminator/``, ``evaluation.json`` and figures.
 """

@@ -98,7 +98,7 @@ class Config:
     """Factor on the observation noise (training: 0)."""
     misjudgement: float = 0.0
     """Factor on how wrong a teacher is about its place, obstacle and terrain, as a student is
-    (``docs/student_limits.md``)."""
+    (``docs/student_experiments.md``)."""
     seed: int = 1000
     """Seed of courses and start places; training draws its own from another generator, so none of them was seen."""
     num_threads: int | None = None

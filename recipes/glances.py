@@ -49,7 +49,7 @@ WEIGHTS = (1.0, 1.0, 4.0, 0.0, 1.0, 0.0, 0.0)
 """Of each in what the encoder descends: each number of the place counts about once."""
 LEVERS = (1.0, 1.0, 3.0, 3.0)
 """Of x, y, sine and cosine of the yaw in the place's: who is turned by a radian too much at what stands 3 m ahead errs
-by 3 m across it, and the yaw is what robots err by before an obstacle (docs/student_limits.md)."""
+by 3 m across it, and the yaw is what robots err by before an obstacle (docs/student_experiments.md)."""
 ROUND = 20
 """Steps of one learning rate, where it falls along half a cosine."""
 Represent = Callable[[Tensor], dict[str, Tensor]]

@@ -66,7 +66,7 @@ class Encounters:
     to go on after a stumble.
 
     Source: ours. The shapes are those of the course (method notes, section 5.7); height fields, the usual way to rough
-    ground, cannot hold bars, and feet catch on their edges (``docs/bbc.md``).
+    ground, cannot hold bars, and feet catch on their edges (``docs/bbc_experiments.md``).
 
     Args:
         num_robots: N.

@@ -11,14 +11,14 @@ from torch import Tensor
 from agility_rl import rotations
 
 SEEN = (0.027, 0.013, 0.0065)
-"""Deviations of an obstacle that has been in view: ahead, aside [m], yaw [rad] (docs/student_limits.md)."""
+"""Deviations of an obstacle that has been in view: ahead, aside [m], yaw [rad] (docs/student_experiments.md)."""
 SPREAD = 0.7
 """Deviation of the logarithm of how wrong a robot is about an obstacle in view: of one much, of most little."""
 LASTING = 0.6
 """Time in which such an error falls to 1/e [s]: images in a row err alike, and what has been counted wrong stays so."""
 UNSEEN = (0.09, 0.125, 0.04)
 """Deviations of one that has not: how far it stands from where it is expected, along, across [m], and turned [rad];
-behind U-turns (docs/student_limits.md)."""
+behind U-turns (docs/student_experiments.md)."""
 GUESSED = 0.95
 """Share of such obstacles whose type is known, since they were seen from afar."""
 VIEW_DISTANCE, VIEW_ANGLE = 3.0, 0.7
@@ -45,8 +45,8 @@ class Misjudgement:
     factor besides. All else that is said of the place follows from there, and the terrain is what lies
     around there. The obstacle after it is unseen, too.
 
-    Source: ours; the sizes are those of a student that matches shapes (docs/student_limits.md). A teacher that learns
-    with them chooses what is good for whoever knows his place no better, and no earlier.
+    Source: ours; the sizes are those of a student that matches shapes (docs/student_experiments.md). A teacher that
+    learns with them chooses what is good for whoever knows his place no better, and no earlier.
 
     Args:
         num_robots: N.

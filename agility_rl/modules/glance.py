@@ -34,7 +34,7 @@ class Glance(nn.Module):
         legs: obstacles of the course.
         hidden: units of the layers between the feature with an expected place and the correction; where an obstacle
             stands from there is a turn and a shift, which several layers say much better than one
-            (docs/student_limits.md).
+            (docs/student_experiments.md).
 
     Example:
         >>> glance = Glance(32, (32, 7, 24), legs=6)

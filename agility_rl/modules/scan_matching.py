@@ -51,14 +51,14 @@ LEAST, SHARE, FAR = 15, 0.3, 0.8
 where it was expected."""
 ASIDE = 0.35
 """So far beside the expected place fits begin too, on either side [m]: from there alone who is that wrong holds a post
-of a tire for the other (docs/student_limits.md)."""
+of a tire for the other (docs/student_experiments.md)."""
 BETTER = (1.05, 2.0)
 """What such a fit explains must be more than this multiple of what the first does, and so many points more."""
 FLOOR = (0.015, 0.015, 0.008)
 """Least deviation of a match: x, y [m], yaw [rad]."""
 HELD = (1.0, 0.1, 0.1)
 """Factors on the variances of a match: edges hold it across and in yaw better than slopes at the solution tell, since
-there points only begin to leave the surface (docs/student_limits.md)."""
+there points only begin to leave the surface (docs/student_experiments.md)."""
 NOTHING = 1e6
 """Variance of what says nothing."""
 FEW, MANY = 12, 60

@@ -32,9 +32,9 @@ def told_of(belief: Tensor, evidence: Tensor, possible: Tensor) -> Tensor:
 
     :math:`\hat l` is the likeliest obstacle, :math:`\bar b_e(w \mid l)` the belief in the way-points of one after the
     evidence. An image shows much that is the same at several obstacles; and in another arena than that of the training
-    it may speak for a wrong one with every frame, by what lies behind the obstacle ahead (docs/student_limits.md). Of
-    one's way-points all after the first count as the one that it speaks for most: an image tells whether an obstacle is
-    entered, but which of its way-points is next is known better from the place (:func:`reached`).
+    it may speak for a wrong one with every frame, by what lies behind the obstacle ahead (docs/student_experiments.md).
+    Of one's way-points all after the first count as the one that it speaks for most: an image tells whether an obstacle
+    is entered, but which of its way-points is next is known better from the place (:func:`reached`).
 
     Source: ours.
 
