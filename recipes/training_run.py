@@ -72,7 +72,13 @@ def own_options(cfg: C) -> C:
     if cfg.resume is None:
         return cfg
     kept = {"resume": cfg.resume, "iterations": cfg.iterations, "max_minutes": cfg.max_minutes}
-    return replace(cli.read_config(cfg.resume, type(cfg)), **kept)  # type: ignore[type-var]
+    own: C = replace(cli.read_config(cfg.resume, type(cfg)), **kept)  # type: ignore[type-var]
+    unheeded = ", ".join(cli.unheeded(cfg, own))
+    print(
+        f"{cfg.resume} goes on with the options that it began with, but for --iterations and --max-minutes"
+        + (f"; not heeded: {unheeded}" if unheeded else "")
+    )
+    return own
 
 
 def run_folder(cfg: RunConfig) -> Path:
@@ -225,8 +231,6 @@ def _run(
     distributed.wait()
     progress: dict[str, float] = {"iteration": 0, "minutes": 0.0}
     saved = SavedRun(folder / "checkpoints", parts, progress)
-    if resumed and first:
-        print("it goes on with the options that it began with, but for --iterations and --max-minutes")
     if resumed and saved.exists():
         saved.load()
     elif resumed and (folder / "policy" / MANIFEST_FILE).is_file():

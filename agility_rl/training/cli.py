@@ -225,6 +225,37 @@ def read_config(folder: str | Path, kind: type[C]) -> C:
         raise ValueError(f"{error}; it is the configuration of a run of {record.get('recipe')}.py") from error
 
 
+def unheeded(asked: Any, began: Any, arguments: Sequence[str] | None = None) -> list[str]:
+    """Options of a command line that a run does not heed, since it began with others, each with what it began with.
+
+    Args:
+        asked: the dataclass instance that the command line gave.
+        began: that of the run.
+        arguments: command line without the program's name; ``sys.argv[1:]`` by default.
+
+    Example:
+        >>> @dataclasses.dataclass(frozen=True)
+        ... class Config:
+        ...     epochs: int = 5
+        ...     mirror: bool = True
+        >>> unheeded(Config(3, False), Config(4), ["cpu", "--epochs", "3", "--no-mirror"])
+        ['--epochs (4)', '--no-mirror (True)']
+    """
+    given = (argument[2:].split("=")[0] for argument in (sys.argv[1:] if arguments is None else arguments))
+    known = [option for option in dict.fromkeys(given) if option.replace("_", "-") in _options(asked)]
+    return [
+        f"--{option} ({_value(began, option)})" for option in known if _value(asked, option) != _value(began, option)
+    ]
+
+
+def _value(config: Any, option: str) -> Any:
+    """What a configuration has for a flag of the command line."""
+    *sections, name = option.replace("-", "_").split(".")
+    for section in sections:
+        config = getattr(config, section)
+    return getattr(config, name) if hasattr(config, name) else getattr(config, name.removeprefix("no_"))
+
+
 def to_json(value: Any) -> Any:
     """Dataclasses, paths and tuples as plain JSON values."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -197,3 +197,15 @@ def test_who_was_started_by_nohup_outlives_its_terminal() -> None:
             assert not interrupted()
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_options_that_a_resumed_run_does_not_heed_are_named() -> None:
+    """Those that were given and differ from its own; what the preset says otherwise was not asked for."""
+    began = Config(ppo=PPO(epochs=7), seed=4)
+    given = ["cpu", "--ppo.clip_epsilon=0.1", "--ppo.fused", "--seed", "4", "--run.hidden", "8", "4"]
+    assert cli.unheeded(from_presets(PRESETS, given), began, given) == [
+        "--ppo.clip_epsilon (0.2)",
+        "--ppo.fused (False)",
+        "--run.hidden ((512, 256))",
+    ]
+    assert cli.unheeded(PRESETS["cpu"], began, ["cpu"]) == []
