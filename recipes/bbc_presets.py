@@ -1,5 +1,6 @@
-"""Presets of stage 1: ``paper`` as published, ``cpu`` tuned for two cores, ``polish`` to go on from a controller that
-has all behaviours (``bbc_distill.py``), ``quickstart`` and ``smoke`` cut from ``cpu``."""
+"""Presets of stage 1: ``paper`` as published, ``cpu`` tuned for two cores, ``half_hour`` for who waits no longer,
+``polish`` to go on from a controller that has all behaviours (``bbc_distill.py``), ``quickstart`` and ``smoke`` cut
+from ``cpu``."""
 
 from __future__ import annotations
 
@@ -90,6 +91,22 @@ CPU = Config(
     adaptation=AdaptationConfig(learning_rate=1e-3, every=20, minibatches=4, privileged_ramp=(100, 200)),
     trials=TrialsConfig(start=1000),
 )
+HALF_HOUR = replace(
+    CPU,
+    name="half_hour",
+    iterations=675,
+    max_minutes=30.0,
+    changes=(
+        (300, "ppo.entropy", 0.0005),
+        (400, "ppo.desired_kl", 0.008),
+        (400, "imitation.imitation_reward", 6.0),
+        (400, "env.jump_weight", 20.0),
+        (450, "env.canter_stance", 0.04),
+        (550, "env.jump_weight", 28.0),
+    ),
+    ppo=replace(CPU.ppo, by_behaviour=True, compile=True),
+    trials=TrialsConfig(start=650),
+)
 POLISH = replace(
     CPU,
     name="polish",
@@ -146,4 +163,11 @@ SMOKE = replace(
     ),
     adaptation=replace(CPU.adaptation, every=2),
 )
-PRESETS = {"smoke": SMOKE, "quickstart": QUICKSTART, "cpu": CPU, "polish": POLISH, "paper": PAPER}
+PRESETS = {
+    "smoke": SMOKE,
+    "quickstart": QUICKSTART,
+    "half_hour": HALF_HOUR,
+    "cpu": CPU,
+    "polish": POLISH,
+    "paper": PAPER,
+}

@@ -10,8 +10,8 @@ Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap``, ``checkpoints/``, ``
     python recipes/bbc_pretrain.py cpu --resume runs/my_run          # goes on exactly where it stopped
     python recipes/bbc_pretrain.py cpu --init-from runs/my_run       # new run that starts from a policy
 
-Presets: ``smoke`` (seconds), ``quickstart`` (about five minutes), ``cpu`` (under an hour on two cores), ``polish``
-(goes on from ``--init-from``, see ``bbc_distill.py``), ``paper``.
+Presets: ``smoke`` (seconds), ``quickstart`` (about five minutes), ``half_hour`` and ``cpu`` (under an hour) on two
+cores, ``polish`` (goes on from ``--init-from``, see ``bbc_distill.py``), ``paper``.
 """
 
 from __future__ import annotations

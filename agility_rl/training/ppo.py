@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.objectives import KLAdaptiveLR, LossModule
 
 from agility_rl.training import distributed
+from agility_rl.training.compilation import compiled
 from agility_rl.training.seeding import permutation
 
 Extra = Callable[[TensorDictBase], Tensor]
@@ -96,7 +97,7 @@ class PPOUpdate:
         compile: bool = False,
     ) -> None:
         self.loss = loss
-        self._losses: Callable[[TensorDictBase], TensorDictBase] = torch.compile(loss, disable=not compile)
+        self._losses: Callable[[TensorDictBase], TensorDictBase] = compiled(loss, compile)
         self.optimizer = optimizer
         self.epochs = epochs
         self.minibatches = minibatches

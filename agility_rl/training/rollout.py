@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from agility_rl.tensors import rows_of
+from agility_rl.training.compilation import compiled
 
 
 class Rollout:
@@ -65,7 +66,7 @@ class Rollout:
         """
         carrier = self.env.reset() if self.carrier is None else self.carrier
         # One policy after another is built of the same parts: what was compiled for the first serves them all.
-        act, judge = (torch.compile(call, disable=not self.compile) for call in (policy, self.value))
+        act, judge = (compiled(call, self.compile) for call in (policy, self.value))
         for step in range(self.num_steps):
             carrier = act(carrier)
             value = judge(carrier)
