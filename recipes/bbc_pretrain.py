@@ -219,7 +219,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     if parts.env.randomization is not None:
         delay = cfg.env.action_delay if iteration >= cfg.env.action_delay_from else 0.0
         parts.env.randomization = replace(parts.env.randomization, action_delay=(delay, delay))
-    policy = parts.bbc.deployable_policy() if with_history else parts.bbc.privileged_policy()
+    policy = parts.bbc.privileged_policy()
+    if with_history:  # not compiled: its convolutions then round otherwise in a run that is resumed
+        policy = torch.compiler.disable(parts.bbc.deployable_policy())
     batch = parts.rollout.collect(policy)
     lap("collect")
     seen = TensorDict(
