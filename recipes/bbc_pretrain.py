@@ -39,6 +39,7 @@ from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.go2 import features
 from agility_rl.losses import functional
 from agility_rl.training import cli, distributed
+from agility_rl.training.compilation import compiled
 from agility_rl.training.distributed import optimized
 
 VELOCITY = features.layout_slice(features.EXPLICIT_LAYOUT, "linear_velocity")
@@ -219,10 +220,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     if parts.env.randomization is not None:
         delay = cfg.env.action_delay if iteration >= cfg.env.action_delay_from else 0.0
         parts.env.randomization = replace(parts.env.randomization, action_delay=(delay, delay))
-    policy = parts.bbc.privileged_policy()
-    if with_history:  # not compiled: its convolutions then round otherwise in a run that is resumed
-        policy = torch.compiler.disable(parts.bbc.deployable_policy())
-    batch = parts.rollout.collect(policy)
+    # Compiled, the history encoder's convolutions would round otherwise in a run that is resumed.
+    taught = compiled(parts.bbc.privileged_policy(), cfg.ppo.compile)
+    batch = parts.rollout.collect(parts.bbc.deployable_policy() if with_history else taught)
     lap("collect")
     seen = TensorDict(
         {keys.MOTION: batch["next", keys.MOTION], keys.SKILL: batch[keys.SKILL], keys.SHIFT: batch[keys.SHIFT]},

@@ -43,8 +43,7 @@ def clone(parts: Components, cfg: CloningConfig, fastest_canter: float = FASTEST
     before = copy.deepcopy(networks).requires_grad_(False)
     allowed = parts.teacher.actor.network.mask == 0.0
     optimizer = torch.optim.Adam(actor.parameters(), lr=cfg.learning_rate, fused=True)
-    # A script asks for numbers at every step, which nobody can compile; and it leads for a few iterations only.
-    policy = torch.compiler.disable(led(parts, script, round(cfg.scripted * parts.env.num_robots)))
+    policy = led(parts, script, round(cfg.scripted * parts.env.num_robots))
     losses: dict[str, Tensor] = {}
     for _ in range(cfg.iterations):
         batch = parts.learner.rollout.collect(policy).select(*actor.in_keys, *READ).flatten()

@@ -206,8 +206,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     """One roll-out of the student and one update of its actor; returns metrics by name."""
     lap = Laps()
     set_course(parts.env, parts.curriculum)
-    # Who is looked at differs from step to step, and with it what would have to be compiled: the student is not.
-    batch = parts.learner.collect(torch.compiler.disable(parts.policy))
+    batch = parts.learner.collect(parts.policy)
     lap("collect")
     metrics: dict[str, Any] = judge(parts.env, parts.curriculum, batch)
     metrics |= add_rewards(None, cfg.reward.task, batch)

@@ -37,6 +37,7 @@ from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.losses import functional
 from agility_rl.modules.teacher import rescale_canter, widen_place
 from agility_rl.training import cli
+from agility_rl.training.compilation import compiled
 
 HEADLINE: tuple[str, ...] = (
     "time/minutes",
@@ -55,10 +56,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     lap = Laps()
     set_course(parts.env, parts.curriculum)
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
-    policy = parts.teacher.privileged_policy()
-    if with_history:  # not compiled: its convolutions then round otherwise in a run that is resumed
-        policy = torch.compiler.disable(parts.teacher.deployable_policy())
-    batch = parts.learner.collect(policy)
+    # Compiled, the history encoder's convolutions would round otherwise in a run that is resumed.
+    taught = compiled(parts.teacher.privileged_policy(), cfg.ppo.compile)
+    batch = parts.learner.collect(parts.teacher.deployable_policy() if with_history else taught)
     lap("collect")
     metrics: dict[str, Any] = judge(parts.env, parts.curriculum, batch)
     metrics |= add_rewards(parts.imitation, cfg.reward.task, batch)

@@ -14,9 +14,12 @@ Call = TypeVar("Call", bound=Callable[..., Any])
 
 
 def compiled(call: Call, enabled: bool) -> Call:
-    """The same function or module, by ``torch.compile`` if enabled.
+    """The same function or module, by ``torch.compile`` if enabled: faster after some ten seconds at the first call.
 
-    Source: none; ``torch.compile``.
+    Numbers differ by rounding; random ones are others, and as sure to come again. One policy after another that is
+    built of the same parts is compiled once.
+
+    Source: no formula; ``torch.compile``.
 
     Args:
         call: function or module.

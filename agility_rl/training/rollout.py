@@ -27,8 +27,8 @@ class Rollout:
         keep: root entries to store (observations, actions, log-probabilities).
         keep_next: entries of the next state to store, e.g. reward and discriminator frames.
         value: callable that maps a TensorDict of observations to values ``[*B, 1]``.
-        compile: fuse policy and value by ``torch.compile``, which takes half a minute at the first step and needs a
-            C++ compiler on a CPU; numbers differ by rounding, and random ones are others, as sure to come again.
+        compile: compile ``value`` for all robots at once (:func:`~agility_rl.training.compilation.compiled`), not for
+            those alone whose episode ends, whose number differs; a policy may be given compiled.
 
     Raises:
         ValueError: if the environment has no batch dimension.
@@ -51,7 +51,7 @@ class Rollout:
         self.keep = list(keep)
         self.keep_next = [*keep_next, "done", "terminated", "truncated"]
         self.value = value
-        self.compile = compile
+        self._value_of_all = compiled(value, compile)
         self.carrier: TensorDictBase | None = None
         self._storage: TensorDictBase | None = None
         self._last_done: Tensor
@@ -65,11 +65,9 @@ class Rollout:
             memory is reused by the next call.
         """
         carrier = self.env.reset() if self.carrier is None else self.carrier
-        # One policy after another is built of the same parts: what was compiled for the first serves them all.
-        act, judge = (compiled(call, self.compile) for call in (policy, self.value))
         for step in range(self.num_steps):
-            carrier = act(carrier)
-            value = judge(carrier)
+            carrier = policy(carrier)
+            value = self._value_of_all(carrier)
             full, upcoming = self.env.step_and_maybe_reset(carrier)
             row = full.select(*self.keep)
             row["state_value"] = value
@@ -88,7 +86,7 @@ class Rollout:
             carrier = upcoming
         assert self._storage is not None
         self.carrier = carrier
-        final = judge(carrier)
+        final = self._value_of_all(carrier)
         self._storage["next", "state_value"][-1] += final.masked_fill(self._last_done, 0.0)
         return self._storage
 

@@ -84,6 +84,16 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished: Path) -> None:
         assert torch.equal(expected, got), name
 
 
+@pytest.mark.slow
+def test_a_compiled_run_is_resumed_bit_for_bit(tmp_path: Path) -> None:
+    """Every second roll-out of ``smoke`` is the history encoder's."""
+    for name, iterations in (("whole", "4"), ("halves", "2")):
+        run(tmp_path, "--name", name, "--iterations", iterations, "--ppo.compile")
+    run(tmp_path, "--resume", str(tmp_path / "halves"), "--iterations", "4")
+    whole, halves = (Artifact.load(tmp_path / name / "policy").state for name in ("whole", "halves"))
+    assert not [name for name, tensor in whole.items() if not torch.equal(tensor, halves[name])]
+
+
 def test_init_from_starts_with_the_given_policy(finished: Path) -> None:
     run(finished, "--name", "child", "--iterations", "1", "--init-from", str(finished / "whole"))
     assert Artifact.load(finished / "child" / "policy").manifest["network"]["hidden"] == [32, 32]

@@ -63,6 +63,19 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smok
         assert torch.equal(read_scalars(whole)[name][1], read_scalars(halves)[name][1]), name
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")  # torch's compiler, of torch itself
+def test_a_compiled_run_is_resumed_bit_for_bit(recipe: ModuleType, smoke: Any) -> None:
+    """Also where it is compiled anew, as in another process."""
+    smoke = replace(smoke, ppo=replace(smoke.ppo, noise_seconds=0.2, compile=True))
+    whole = recipe.train(replace(smoke, name="whole", iterations=4))
+    halves = recipe.train(replace(smoke, name="halves", iterations=2))
+    torch.compiler.reset()
+    recipe.train(replace(smoke, resume=halves, iterations=4))
+    one, other = (Artifact.load(run / "policy").state for run in (whole, halves))
+    assert not [name for name in one if not torch.equal(one[name], other[name])]
+
+
 def test_a_finished_course_is_worth_what_the_option_says(recipe: ModuleType) -> None:
     finished = torch.tensor([[[True], [False]], [[False], [False]]])
     values = torch.tensor([[[46.0], [9.0]], [[0.0], [8.0]]])

@@ -16,6 +16,7 @@ from torchrl.objectives.value import GAE
 from agility_rl import keys
 from agility_rl.envs import LocomotionEnv
 from agility_rl.modules import Critic, GaussianActor
+from agility_rl.training.compilation import compiled
 from agility_rl.training.rollout import Rollout
 
 N, T = 4, 12
@@ -162,13 +163,14 @@ def test_a_compiled_roll_out_is_the_eager_one_but_for_rounding_and_its_draws(bui
         worth = lambda td: critic(td.select(*critic.in_keys))["state_value"]  # noqa: E731
         made = Rollout(build(seed=4), T, keep=keep, keep_next=["reward"], value=worth, compile=compile)
         torch.manual_seed(seed)
-        return torch.cat([made.collect(TensorDictSequential(actor)).clone() for _ in range(times)])
+        policies = [compiled(TensorDictSequential(actor), compile) for _ in range(times)]
+        return torch.cat([made.collect(policy).clone() for policy in policies])
 
     with set_interaction_type(InteractionType.DETERMINISTIC):
-        eager, compiled = collect(False, 2), collect(True, 2)
+        eager, fused = collect(False, 2), collect(True, 2)
     assert eager["next", "truncated"].any()
     for name, entry in eager.items(include_nested=True, leaves_only=True):
-        torch.testing.assert_close(compiled[name], entry, atol=2e-3, rtol=2e-3, msg=str(name))
+        torch.testing.assert_close(fused[name], entry, atol=2e-3, rtol=2e-3, msg=str(name))
     first, again, other = collect(True, 10, 1), collect(True, 10, 1), collect(True, 10, 2)
     assert torch.equal(first[keys.ACTION], again[keys.ACTION])
     assert not torch.equal(first[keys.ACTION], other[keys.ACTION])
