@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
 from bbc_presets import CPU
 from rich.console import Console
 from rollouts import MotionConfig
@@ -169,4 +168,4 @@ def main(config: Config, console: Console) -> dict[str, list[dict[str, Any]]]:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        main(tyro.cli(Config, description=__doc__), cli.console(140))
+        main(cli.from_arguments(Config, doc=__doc__), cli.console(140))

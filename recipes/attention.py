@@ -204,7 +204,7 @@ def print_attention(result: Mapping[str, Any], disturbances: Mapping[str, str], 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
-    config = tyro.cli(Config, args=arguments, description=__doc__)
+    config = cli.from_arguments(Config, arguments, doc=__doc__)
     with cli.one_line_errors():
         attend(config, cli.console(160))
 

@@ -173,7 +173,7 @@ def show(config: Config, trials: Trials, console: Console) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
-    config = tyro.cli(Config, args=arguments, description=__doc__)
+    config = cli.from_arguments(Config, arguments, doc=__doc__)
     with cli.one_line_errors():
         show(config, hold_trials(config), cli.console(140))
 

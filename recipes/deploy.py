@@ -241,4 +241,4 @@ def main(cfg: Config) -> int:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        sys.exit(main(tyro.cli(Config, description=__doc__)))
+        sys.exit(main(cli.from_arguments(Config, doc=__doc__)))

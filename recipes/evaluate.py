@@ -285,4 +285,4 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        evaluate(tyro.cli(Config, description=__doc__), cli.console(140))
+        evaluate(cli.from_arguments(Config, doc=__doc__), cli.console(140))

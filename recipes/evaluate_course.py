@@ -242,7 +242,7 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
-    config = tyro.cli(Config, args=arguments, description=__doc__)
+    config = cli.from_arguments(Config, arguments, doc=__doc__)
     with cli.one_line_errors():
         evaluate(config, cli.console(160))
 

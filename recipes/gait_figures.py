@@ -210,4 +210,4 @@ def main(config: Config, console: Console) -> list[Path]:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        main(tyro.cli(Config, description=__doc__), cli.console(140))
+        main(cli.from_arguments(Config, doc=__doc__), cli.console(140))

@@ -220,4 +220,4 @@ def main(config: Config, console: Console) -> int:
 if __name__ == "__main__":
     torch.set_num_threads(1)  # clips are small; threads would only wait for each other
     with cli.one_line_errors():
-        sys.exit(main(tyro.cli(Config, description=__doc__), cli.console(220)))
+        sys.exit(main(cli.from_arguments(Config, doc=__doc__), cli.console(220)))

@@ -155,4 +155,4 @@ def main(cfg: Config) -> None:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        main(tyro.cli(Config, description=__doc__))
+        main(cli.from_arguments(Config, doc=__doc__))

@@ -227,4 +227,4 @@ def main(config: Config) -> Path:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        print(main(tyro.cli(Config, description=__doc__)).as_posix())
+        print(main(cli.from_arguments(Config, doc=__doc__)).as_posix())

@@ -224,4 +224,4 @@ def main(cfg: Config, console: Console | None = None) -> dict[float, dict[str, F
 if __name__ == "__main__":
     torch.set_num_threads(1)
     with cli.one_line_errors():
-        main(tyro.cli(Config, description=__doc__))
+        main(cli.from_arguments(Config, doc=__doc__))

@@ -74,10 +74,11 @@ def own_options(cfg: C) -> C:
     kept = {"resume": cfg.resume, "iterations": cfg.iterations, "max_minutes": cfg.max_minutes}
     own: C = replace(cli.read_config(cfg.resume, type(cfg)), **kept)  # type: ignore[type-var]
     unheeded = ", ".join(cli.unheeded(cfg, own))
-    print(
-        f"{cfg.resume} goes on with the options that it began with, but for --iterations and --max-minutes"
-        + (f"; not heeded: {unheeded}" if unheeded else "")
-    )
+    if distributed.rank() == 0:
+        print(
+            f"{cfg.resume} goes on with the options that it began with, but for --iterations and --max-minutes"
+            + (f"; not heeded: {unheeded}" if unheeded else "")
+        )
     return own
 
 

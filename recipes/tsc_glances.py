@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-import tyro
 from glances import ROUND, Glances
 from learning_rates import half_cosine, set_learning_rate
 from safetensors.torch import load_file
@@ -177,4 +176,4 @@ def main(cfg: Config) -> Path:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        main(tyro.cli(Config, description=__doc__))
+        main(cli.from_arguments(Config, doc=__doc__))

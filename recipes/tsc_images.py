@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-import tyro
 from course_metrics import judge, set_course
 from glances import asked, known_terrain
 from safetensors.torch import save_file
@@ -120,4 +119,4 @@ def main(cfg: Config) -> Path:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        main(tyro.cli(Config, description=__doc__))
+        main(cli.from_arguments(Config, doc=__doc__))

@@ -10,6 +10,7 @@ import dataclasses
 import difflib
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import signal
@@ -89,7 +90,28 @@ def from_presets(
                 _stop(f"unknown option --{option}; {_suggest(option, options, '--')} (all of them: --help)")
     description = f"{doc or kind.__doc__ or ''}\n\nPresets: {names}; the defaults shown are those of {name!r}."
     program = f"{Path(sys.argv[0]).name} {name}"
-    return tyro.cli(kind, args=arguments, default=presets[name], prog=program, description=description)
+    return _finite(tyro.cli(kind, args=arguments, default=presets[name], prog=program, description=description))
+
+
+def from_arguments(kind: type[C], args: Sequence[str] | None = None, *, doc: str | None = None) -> C:
+    """Read a command line without presets: every field of a dataclass a flag, or an argument in its place.
+
+    Args:
+        kind: dataclass with defaults; ``tyro.conf.Positional`` makes a field an argument.
+        args: command line without the program's name; ``sys.argv[1:]`` by default.
+        doc: description shown by ``--help``, such as the recipe's ``__doc__``.
+
+    Raises:
+        SystemExit: on ``--help`` (status 0) and on any error (status 2).
+
+    Example:
+        >>> @dataclasses.dataclass(frozen=True)
+        ... class Config:
+        ...     seconds: float = 20.0
+        >>> from_arguments(Config, ["--seconds", "8"])
+        Config(seconds=8.0)
+    """
+    return _finite(tyro.cli(kind, args=args, description=doc))
 
 
 @contextlib.contextmanager
@@ -337,6 +359,16 @@ def _options(config: Any, prefix: str = "") -> list[str]:
             if isinstance(value, bool):
                 found.append(f"{prefix}no-{name}")
     return found
+
+
+def _finite(config: C) -> C:
+    """The same, if its numbers are numbers: NaN compares with nothing, and passes the checks that come later."""
+    for option in _options(config):
+        value = _value(config, option)
+        numbers = [number for number in (value if isinstance(value, tuple) else (value,)) if isinstance(number, float)]
+        if not all(map(math.isfinite, numbers)):
+            _stop(f"--{option} must be finite, got {' '.join(map(str, numbers))}")
+    return config
 
 
 def _suggest(name: str, known: list[str], dashes: str = "") -> str:

@@ -45,8 +45,8 @@ def processes(cuda: bool | None = None) -> Iterator[None]:
 
 
 def rank() -> int:
-    """Which of the processes this is; 0 writes logs and checkpoints."""
-    return dist.get_rank() if dist.is_initialized() else 0
+    """Which of the processes this is, joined or not; 0 writes logs and checkpoints."""
+    return dist.get_rank() if dist.is_initialized() else int(os.environ.get("RANK", "0"))
 
 
 def size() -> int:

@@ -78,6 +78,8 @@ def test_a_default_preset() -> None:
         (["cpuu"], "unknown preset 'cpuu'; did you mean 'cpu'?".replace("'cpu'?", "cpu?")),
         ([], "expected a preset first, one of paper, cpu; got nothing"),
         (["--seed", "1"], "expected a preset first, one of paper, cpu; got --seed"),
+        (["cpu", "--ppo.clip-epsilon", "nan"], "--ppo.clip-epsilon must be finite, got nan"),
+        (["cpu", "--ppo.clip-epsilon=inf"], "--ppo.clip-epsilon must be finite, got inf"),
     ],
 )
 def test_mistakes_end_in_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

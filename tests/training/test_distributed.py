@@ -49,8 +49,10 @@ def updated(rows):
     return torch.cat([p.detach().flatten() for p in distributed.optimized(optimizer)]), metrics["kl"]
 
 alone, kl_alone = updated(slice(None))
+before = distributed.rank()
 with distributed.processes():
     rank = distributed.rank()
+    assert before == rank
     assert distributed.size() == 2
     value = torch.tensor([1.0, 2.0]) + 2.0 * rank
     assert distributed.total(value).tolist() == [4.0, 6.0] and value.tolist() == [1.0 + 2.0 * rank, 2.0 + 2.0 * rank]
