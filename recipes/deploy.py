@@ -47,7 +47,7 @@ from agility_rl.deploy.depth import DepthSource
 from agility_rl.deploy.operator import Operation, SharedControl
 from agility_rl.go2.appearance import dress
 from agility_rl.go2.model import build_spec
-from agility_rl.record import EpisodeRecorder
+from agility_rl.record import EpisodeRecorder, free_file, is_free
 from agility_rl.training import cli
 
 SINK_SECONDS = 1.5
@@ -122,14 +122,6 @@ class Procedure:
             self.finished = True
 
 
-def free_file(folder: Path) -> Path:
-    """``deploy_N.mcap`` with the first N that is free; what a killed run has left in writing is not overwritten."""
-    number = 0
-    while any((folder / name).exists() for name in (f"deploy_{number}.mcap", f".deploy_{number}.mcap.incoming")):
-        number += 1
-    return folder / f"deploy_{number}.mcap"
-
-
 def summary(controller: Controller, lost: float | None, started: float) -> str:
     """What the loop did, in lines."""
 
@@ -158,8 +150,8 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
     """Run, record, print what happened."""
     command = BehaviourCommand.of(cfg.skill, velocity_x=cfg.speed, yaw_rate=cfg.yaw_rate, height=cfg.height)
     bbc = cfg.controller(cfg.artifact)
-    path = free_file(Path("runs") / "deploy") if cfg.output is None else cfg.output
-    if path.suffix != ".mcap" or path.exists():
+    path = free_file(Path("runs") / "deploy", "deploy") if cfg.output is None else cfg.output
+    if path.suffix != ".mcap" or not is_free(path):
         raise ValueError(f"expected --output to be a new file that ends in .mcap, got {path}")
     cfg.check()
     if cfg.real and cfg.operator == "script" and not cfg.unattended:

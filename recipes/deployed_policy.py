@@ -62,7 +62,7 @@ def load_camera(text: str) -> Any:
     sys.path.insert(0, str(Path.cwd()))
     try:
         camera = getattr(importlib.import_module(module), name)()
-    except (ImportError, AttributeError, ValueError, RuntimeError) as error:  # drivers raise the last
+    except (ImportError, AttributeError, TypeError, ValueError, RuntimeError) as error:  # drivers raise the last
         raise ValueError(f"--camera: expected MODULE:NAME of a class or function, got {text!r}: {error}") from error
     finally:
         sys.path.pop(0)

@@ -38,7 +38,7 @@ from tsc_artifacts import load_trained
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS, NUM_BEHAVIOURS, command_bounds
 from agility_rl.deploy import behaviour, task
-from agility_rl.deploy.artifact import CHECKSUM, Artifact, ArtifactError, build_manifest
+from agility_rl.deploy.artifact import CHECKSUM, MANIFEST_FILE, Artifact, ArtifactError, build_manifest
 from agility_rl.go2 import features
 from agility_rl.modules import RecurrentStudent
 from agility_rl.training import cli
@@ -248,8 +248,11 @@ def main(cfg: Config) -> Path:
     of_student = cfg.run.is_dir() and Artifact.load(cfg.run).manifest["kind"] == "student"
     export = student_to_export(cfg) if of_student else controller_to_export(cfg)
     source, output = export.artifact, cfg.output or export.artifact.folder
-    manifest, answers = complete_manifest(export), check_network(export)
     weights = source.manifest["weights"]["sha256"]
+    there = Artifact.load(output).manifest["weights"]["sha256"] if (output / MANIFEST_FILE).is_file() else weights
+    if there != weights or (output / "policy" / MANIFEST_FILE).is_file():  # which it would hide
+        raise FileExistsError(f"--output {output} holds another policy already; choose another folder, or remove it")
+    manifest, answers = complete_manifest(export), check_network(export)
     content = to_onnx(export, {**manifest, "weights_sha256": weights})
     digest = hashlib.sha256(content).hexdigest()
     entry = {

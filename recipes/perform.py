@@ -33,7 +33,7 @@ from agility_rl.deploy import Mode
 from agility_rl.deploy.browser import LOOPBACK, BrowserDevice, exposure
 from agility_rl.deploy.operator import Status
 from agility_rl.go2 import features
-from agility_rl.record import EpisodeRecorder, read_episode
+from agility_rl.record import EpisodeRecorder, free_file, read_episode
 from agility_rl.record.episode import read_metadata
 from agility_rl.record.layout import write_layout
 from agility_rl.training import cli
@@ -77,14 +77,6 @@ def command_for(skill: int, speed: float | None, yaw_rate: float) -> Tensor:
     command[0] = command[0] if speed is None else min(max(speed, float(low[0])), float(high[0]))
     command[2] = min(max(yaw_rate, float(low[2])), float(high[2]))
     return command[None]
-
-
-def free_name(folder: Path) -> str:
-    """``perform_N`` with the first N that no episode has."""
-    number = 0
-    while (folder / f"perform_{number}.mcap").exists():
-        number += 1
-    return f"perform_{number}"
 
 
 def perform(controller: Controller, config: Config, path: Path) -> str | None:
@@ -163,8 +155,7 @@ def main(config: Config, console: Console) -> Path:
         skill_index(name)
     controller = load_controller(config.run)
     output = config.output or controller.run
-    name = free_name(output / "episodes")
-    episode = output / "episodes" / f"{name}.mcap"
+    episode = free_file(output / "episodes", "perform")
     fall = perform(controller, config, episode)
     plots = {
         f"{title}": [f"/command.{key}", f"/measured.{key}"]
@@ -178,7 +169,7 @@ def main(config: Config, console: Console) -> Path:
     console.print(f"{episode}: {shown}", markup=False)
     console.print(f"{layout}: import it in Foxglove beside the episode", markup=False)
     if config.strip:
-        picture = output / "figures" / f"{name}.png"
+        picture = output / "figures" / f"{episode.stem}.png"
         reason = render(episode, picture, config.skin)
         console.print(
             f"{picture}" if reason is None else f"no pictures, this machine cannot render: {reason}", markup=False

@@ -71,6 +71,8 @@ class RobotConfig:
         for option in ("simulator", "course", "world"):
             if self.real and getattr(self, option) is not None:
                 raise ValueError(f"expected --{option} only with a simulated robot, got a real one")
+        if not self.sim_dt > 0.0:
+            raise ValueError(f"expected --sim-dt above 0 s, got {self.sim_dt}")
         if self.course is not None and self.world is not None:
             raise ValueError("expected --course or --world, got both")
         if self.world is not None:

@@ -17,6 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from agility_rl import rotations
 from agility_rl.behaviours import NUM_BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact, ArtifactError
+from agility_rl.deploy.networks import load_network
 from agility_rl.envs import LocomotionEnv
 from agility_rl.go2 import constants, features
 from agility_rl.go2.kinematics import forward
@@ -95,8 +96,7 @@ def load_controller(path: Path) -> Controller:
     artifact = Artifact.load(path, kind="bbc")
     if "network" not in artifact.manifest:
         raise ArtifactError(f"{artifact.folder}: the manifest lacks 'network'; export the policy with bbc_pretrain.py")
-    bbc = BasicBehaviourController(**artifact.manifest["network"])
-    artifact.fill(bbc)
+    bbc = load_network(BasicBehaviourController, artifact)
     file = run / "config.json"
     trained = json.loads(file.read_text(encoding="utf-8"))["config"] if file.is_file() else {}
     configured = trained.get("env", {}).get("friction_loss", 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,12 +12,13 @@ from tsc_config import Config as TeacherConfig
 
 from agility_rl import behaviours, keys
 from agility_rl.deploy.artifact import MANIFEST_FILE, Artifact, ArtifactError
+from agility_rl.deploy.networks import load_network
 from agility_rl.deploy.task import check_camera, fastest_canter
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import constants, features
 from agility_rl.modules import RecurrentStudent, Teacher
 
-NETWORKS: dict[str, type[Teacher] | type[RecurrentStudent]] = {"teacher": Teacher, "student": RecurrentStudent}
+NETWORKS: dict[str, Callable[..., Teacher | RecurrentStudent]] = {"teacher": Teacher, "student": RecurrentStudent}
 RECIPES = {"teacher": "tsc_teacher.py", "student": "tsc_student.py"}
 
 
@@ -93,19 +94,16 @@ def load_trained(path: Path, kind: str | None = None, allowed: Sequence[str] | N
     if manifest["kind"] == "student":
         check_camera(artifact)
     network = dict(manifest["network"])
-    if network["num_obstacles"] != len(OBSTACLES):
-        raise ArtifactError(
-            f"{artifact.folder}: knows {network['num_obstacles']} types of obstacles, expected {len(OBSTACLES)}"
-        )
-    known = range(behaviours.NUM_BEHAVIOURS) if network["allowed"] is None else network["allowed"]
+    if (types := network.get("num_obstacles")) != len(OBSTACLES):
+        raise ArtifactError(f"{artifact.folder}: knows {types} types of obstacles, expected {len(OBSTACLES)}")
+    known = network.get("allowed") or range(behaviours.NUM_BEHAVIOURS)
     if allowed is not None:
         network["allowed"] = sorted(behaviours.skill_index(name) for name in allowed)
         if not allowed or not set(network["allowed"]) <= set(known):
             names = ", ".join(behaviours.BEHAVIOURS[index] for index in known)
             raise ValueError(f"--behaviours: expected some of those that it was trained with, {names}; got {allowed}")
-    module = NETWORKS[manifest["kind"]](**network)
-    artifact.fill(module)
-    return Trained(module, artifact, run, tuple(network["allowed"] or known))
+    module = load_network(NETWORKS[manifest["kind"]], artifact, network)
+    return Trained(module, artifact, run, tuple(network.get("allowed") or known))
 
 
 def load_bbc_of(trained: Trained, bbc: Path | None) -> Controller:

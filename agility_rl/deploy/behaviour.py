@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from agility_rl import keys, rotations
 from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.deploy.commander import BehaviourCommand
+from agility_rl.deploy.networks import load_network
 from agility_rl.deploy.onnx import onnx_session
 from agility_rl.deploy.transport import RobotState
 from agility_rl.go2 import constants, features
@@ -86,8 +87,7 @@ def torch_network(artifact: Artifact) -> BBCNetwork:
         )
     artifact.check_layout(keys.PROPRIOCEPTION, features.PROPRIOCEPTION_LAYOUT)
     artifact.check_layout(keys.EXPLICIT, features.EXPLICIT_LAYOUT)
-    bbc = BasicBehaviourController(**artifact.manifest["network"])
-    artifact.fill(bbc)
+    bbc = load_network(BasicBehaviourController, artifact)
     return BBCNetwork(bbc.eval().requires_grad_(False))
 
 
@@ -109,7 +109,8 @@ class DeployedBBC:
     In every control step call :meth:`observe`, then :meth:`act`. After :meth:`reset` the history is filled with copies
     of the first observation and the last action is zero, as at the start of an episode. The highest trunk of the last
     0.9 s, which the policy sees while jumping, is taken from the trunk position if the robot's state has one and
-    ``use_trunk_position`` is set; otherwise from the network's own estimates, the last of them one step old.
+    ``use_trunk_position`` is set; otherwise from the network's own estimates, the last of them one step old, and at
+    first from the height of a robot that stands.
 
     Source: method notes, section 3.2.
 
@@ -191,7 +192,7 @@ class DeployedBBC:
         """
         if self._history is None:
             raise RuntimeError("act() needs an observation: call observe(state) first, in every control step")
-        peak = max(self._heights) if command.jumping and self._heights else 0.0
+        peak = max(self._heights, default=constants.STANDING_HEIGHT) if command.jumping else 0.0
         action, estimate = self.network(
             self._history[-1:], self._history[None], command.vector()[None], torch.tensor([[peak]])
         )

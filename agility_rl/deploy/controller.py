@@ -125,7 +125,7 @@ class Controller:
 
     Attributes:
         mode: present mode.
-        fault: what led to ``damping`` the last time, if it was a fault.
+        fault: what led to ``damping`` the last time, if it was a fault and no request has been granted since.
         events: most recent changes of mode, refusals and misses.
         deadlines: periods, misses, durations, latenesses.
 
@@ -317,6 +317,8 @@ class Controller:
         if wanted is Mode.RUN:
             self.bbc.reset()
             self.commander.reset()
+        if wanted is not self.mode:
+            self.fault = None
         self._enter(wanted, "requested")
 
     def _refusal(self, wanted: Mode, state: RobotState | None, now: float) -> str | None:

@@ -117,6 +117,7 @@ def participant(interface: str | None, domain: int) -> Any:
 
     Raises:
         ValueError: if there is no such interface or domain, or this process is in the domain by another interface.
+        ConnectionError: if the interface is there and the network cannot be joined by it.
         ModuleNotFoundError: if CycloneDDS is not installed.
     """
     if not 0 <= domain <= LARGEST_DOMAIN:
@@ -125,16 +126,23 @@ def participant(interface: str | None, domain: int) -> Any:
     if interface is not None and interface not in names:
         raise ValueError(f"expected a network interface of this machine ({', '.join(names)}), got {interface!r}")
     message_types()
+    from cyclonedds.core import DDSException
     from cyclonedds.domain import Domain, DomainParticipant
 
     # The loopback interface does carry multicast, but Linux does not say so: it has to be told.
     chosen = 'address="127.0.0.1" multicast="true"' if interface is None else f"name={quoteattr(interface)}"
-    if domain not in _domains:
-        settings = f"<General><Interfaces><NetworkInterface {chosen}/></Interfaces></General>"
-        _domains[domain] = chosen, Domain(domain, f'<CycloneDDS><Domain Id="any">{settings}</Domain></CycloneDDS>')
-    elif _domains[domain][0] != chosen:
+    if domain in _domains and _domains[domain][0] != chosen:
         raise ValueError(f"this process is in DDS domain {domain} by another interface already; expected one interface")
-    return DomainParticipant(domain)
+    try:
+        if domain not in _domains:
+            settings = f"<General><Interfaces><NetworkInterface {chosen}/></Interfaces></General>"
+            _domains[domain] = chosen, Domain(domain, f'<CycloneDDS><Domain Id="any">{settings}</Domain></CycloneDDS>')
+        return DomainParticipant(domain)
+    except DDSException as error:
+        place = "the loopback interface" if interface is None else f"the interface {interface}"
+        raise ConnectionError(
+            f"cannot join DDS domain {domain} by {place}: is it up, its cable in, and has it an address? {error}"
+        ) from error
 
 
 class _Line:
@@ -177,9 +185,10 @@ class _Line:
 class DDSTransport:
     """The controller's end of the line to a Go2, or to what speaks like one.
 
-    Another program that commands the same robot is heard on the topic itself, the robot's own sport mode as well if it
-    is still on and speaks there. L2 and B held down on the remote control count as a commander too, because nothing on
-    the robot need obey the remote in low-level control.
+    It stays with the robot that it hears first, and what is said twice counts once: a repeater must not keep the last
+    word of a silent robot young. Another program that commands the same robot is heard on the topic itself, the robot's
+    own sport mode as well if it is still on and speaks there. Another robot in the domain obeys the same commands, and
+    L2 and B held down on the remote control need not be obeyed in low-level control: both count as commanders too.
 
     Source: supplement S3 (low-level control of the motors); Unitree's IDL and topic names.
 
@@ -192,7 +201,7 @@ class DDSTransport:
     Raises:
         ModuleNotFoundError: if CycloneDDS is not installed.
         ValueError: if there is no such interface or domain.
-        ConnectionError: if no robot speaks.
+        ConnectionError: if the network cannot be joined, or no robot speaks.
 
     Example:
         >>> DDSTransport("none0")
@@ -215,6 +224,8 @@ class DDSTransport:
         self._feet = unitree.FootCalibration() if feet is None else feet
         self._others, self._stop_pressed = Commanders(), False
         self._state: RobotState | None = None
+        self._robot, self._checksum = 0, 0
+        self._strangers = Commanders()
         self._arrived = time.monotonic()
         self._listen()
         end = time.monotonic() + patience
@@ -241,8 +252,13 @@ class DDSTransport:
         """Newest state; its time is that of its arrival here."""
         arrived = self._arrived  # before it is taken, so that a state never seems younger than it is
         for message in self._line.take(unitree.STATE_TOPIC):
-            self._state = unitree.from_low_state(message, arrived, self._feet)
-            self._stop_pressed = unitree.stop_is_pressed(message.wireless_remote)
+            robot = message.sample_info.publication_handle
+            if self._state is not None and robot != self._robot:
+                self._strangers.heard(robot, time.monotonic())
+            elif self._state is None or message.crc != self._checksum:
+                self._state = unitree.from_low_state(message, arrived, self._feet)
+                self._robot, self._checksum = robot, message.crc
+                self._stop_pressed = unitree.stop_is_pressed(message.wireless_remote)
         return self._state
 
     def send(self, command: JointCommand) -> None:
@@ -250,13 +266,17 @@ class DDSTransport:
         self._line.writer.write(to_message(unitree.to_low_command(command)))
 
     def other_commanders(self) -> Sequence[str]:
-        """Who else has commanded this robot within half a second, and the remote control if it says stop."""
+        """Who else has commanded this robot within half a second, other robots that speak, a remote that says stop."""
         now = time.monotonic()
         for message in self._line.take(unitree.COMMAND_TOPIC):
             self._others.heard(message.sample_info.publication_handle, now)
         count = self._others.count(now)
-        others = (f"{count} other program{'s' if count > 1 else ''}",) if count else ()
-        return others + (("the remote control (L2 + B)",) if self._stop_pressed else ())
+        others = {
+            f"{count} other program{'s' if count > 1 else ''}": count,
+            f"another robot on {unitree.STATE_TOPIC}": self._strangers.count(now),
+            "the remote control (L2 + B)": self._stop_pressed,
+        }
+        return tuple(name for name, heard in others.items() if heard)
 
     def close(self) -> None:
         """Leave the domain."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import secrets
 import socket
 import struct
@@ -177,7 +178,7 @@ class LoopbackTransport:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((HOST, 0))
         self._robot = (HOST, port)
-        self._session, self._sequence = secrets.randbits(64), 0
+        self._session, self._sequence, self._sent = secrets.randbits(64), 0, -math.inf
         self._state: RobotState | None = None
         self._frame: Frame | None = None
         self._commanders = 0
@@ -235,13 +236,14 @@ class LoopbackTransport:
 
     def send(self, command: JointCommand) -> None:
         """Give the motors a command; lost if the robot's process has ended."""
-        self._sequence += 1
+        self._sequence, self._sent = self._sequence + 1, time.monotonic()
         with contextlib.suppress(ConnectionRefusedError, BlockingIOError):
             self._socket.sendto(pack_command(command, self._session, self._sequence), self._robot)
 
     def other_commanders(self) -> Sequence[str]:
         """Whether the robot hears commands of more programs than this one."""
-        mine = 1 if self._sequence else 0
+        # The robot forgets who is silent; who is silent knows it a little earlier, and never takes itself for alone.
+        mine = 1 if time.monotonic() - self._sent < Commanders.memory else 0
         others = self._commanders - mine
         return (f"{others} other program{'s' if others > 1 else ''}",) if others > 0 else ()
 

@@ -24,6 +24,8 @@ LYING_HEIGHT = 0.09
 """Trunk height from which a folded robot is let down on the ground [m]."""
 PREFIX = "world/"
 """Before the names of what :func:`add_world` adds."""
+_ROUNDING = 1e-6
+"""Share of a physics step by which sums of times may be short."""
 _JOINTS, _SPEEDS = slice(7, 19), slice(6, 18)
 _FEET = [3 * group + axis for group in constants.FOOT_GROUPS for axis in range(3)]
 
@@ -43,6 +45,9 @@ class SimulatedRobot:
         damping_factor: likewise; a robot is not what its data sheet says.
         surround: called with the robot's spec before it is compiled, to add what stands around it.
         **model_options: keyword arguments of :func:`agility_rl.go2.model.build_spec`.
+
+    Raises:
+        ValueError: if the physics step is not above 0.
 
     Attributes:
         model: engine model; :attr:`data` its state.
@@ -66,11 +71,14 @@ class SimulatedRobot:
         surround: Callable[[mujoco.MjSpec], object] = lambda spec: None,
         **model_options: Any,
     ) -> None:
+        if not sim_dt > 0.0:
+            raise ValueError(f"expected a physics step above 0 s, got {sim_dt}")
         spec = build_spec(sim_dt=sim_dt, **model_options)
         surround(spec)
         self.model: Any = spec.compile()
         self.data: Any = mujoco.MjData(self.model)
         self.sim_dt, self.command_timeout = sim_dt, command_timeout
+        self._owed = 0.0
         self._factors = np.asarray(stiffness_factor, np.float32), np.asarray(damping_factor, np.float32)
         self._sequence = 0
         self.reset()
@@ -98,6 +106,7 @@ class SimulatedRobot:
     def place(self, qpos: np.ndarray, qvel: np.ndarray, command: JointCommand | None = None) -> None:
         """Put the robot into a state of the engine, ``[19]`` and ``[18]``; without a command, the motors damp."""
         mujoco.mj_resetData(self.model, self.data)
+        self._owed = 0.0
         self.data.qpos[: len(qpos)], self.data.qvel[: len(qvel)] = qpos, qvel  # moving obstacles come behind
         self.command(JointCommand.damped(DAMPING_GAIN) if command is None else command)
         mujoco.mj_forward(self.model, self.data)
@@ -113,8 +122,10 @@ class SimulatedRobot:
         self._commanded = self.time
 
     def advance(self, seconds: float) -> None:
-        """Let time pass, a multiple of the physics step."""
-        for _ in range(round(seconds / self.sim_dt)):
+        """Let time pass; what is no whole physics step is made up for by later calls."""
+        steps = int((self._owed + seconds) / self.sim_dt + _ROUNDING)
+        self._owed += seconds - steps * self.sim_dt
+        for _ in range(steps):
             if self.command_timeout is not None and self.time - self._commanded > self.command_timeout:
                 self.command(JointCommand.damped(DAMPING_GAIN))
             mujoco.mj_step(self.model, self.data)

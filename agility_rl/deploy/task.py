@@ -13,6 +13,7 @@ from agility_rl import behaviours, keys
 from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.deploy.commander import BehaviourCommand, Perception
 from agility_rl.deploy.depth import DepthPreprocessor, DepthSource
+from agility_rl.deploy.networks import load_network
 from agility_rl.deploy.onnx import onnx_session
 from agility_rl.go2 import camera, features
 from agility_rl.modules import RecurrentStudent
@@ -220,8 +221,7 @@ def torch_student(artifact: Artifact) -> StudentNetwork:
         ArtifactError: if it is no student, its images were others, or the weights are not those of its network.
     """
     check_student(artifact)
-    student = RecurrentStudent(**artifact.manifest["network"])
-    artifact.fill(student)
+    student = load_network(RecurrentStudent, artifact)
     return StudentNetwork(student.eval().requires_grad_(False))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,25 @@ from agility_rl.record.scene import WORLD, Shape, body_transforms, entity, foot_
 Contacts = message_type("Contacts", dict.fromkeys(constants.LEGS, "bool"))
 TRANSFORMS, JOINTS, CONTACTS, SCENE, FEET = "/tf", "/joint_states", "/contacts", "/scene", "/feet"
 RESERVED = {topic[1:] for topic in (TRANSFORMS, JOINTS, CONTACTS, SCENE, FEET)}
+
+
+def is_free(path: Path) -> bool:
+    """Whether no episode has this name, neither a finished one nor one in writing, which a killed run may have left."""
+    return not path.exists() and not _staged(path).exists()
+
+
+def free_file(folder: Path, stem: str) -> Path:
+    """``STEM_N.mcap`` with the first N that is free.
+
+    Example:
+        >>> free_file(Path("nowhere"), "trot").name
+        'trot_0.mcap'
+    """
+    return next(path for number in itertools.count() if is_free(path := folder / f"{stem}_{number}.mcap"))
+
+
+def _staged(path: Path) -> Path:
+    return path.with_name(f".{path.name}.incoming")
 
 
 class EpisodeRecorder:
@@ -71,7 +91,7 @@ class EpisodeRecorder:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.num_steps = 0
         self._period = round(dt * 1e9)
-        self._staged = self.path.with_name(f".{self.path.name}.incoming")
+        self._staged = _staged(self.path)
         self._file = open(self._staged, "wb")  # noqa: SIM115  (closed by close)
         self._writer = Writer(self._file)
         self._contact: list[bool] | None = None

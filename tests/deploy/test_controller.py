@@ -266,6 +266,21 @@ def test_after_a_fault_it_can_stand_up_again(running: Running, bus: FakeBus) -> 
     assert controller.step().mode is Mode.STAND_UP
 
 
+def test_a_fault_is_history_once_a_request_was_granted(running: Running, bus: FakeBus) -> None:
+    controller = running()
+    bus.age = 1.0
+    controller.step()
+    bus.age = 0.0
+    controller.request(Mode.DAMPING)
+    assert controller.step().mode is Mode.DAMPING and controller.fault is not None, "damping led nowhere else"
+    controller.request(Mode.RUN)
+    controller.step()
+    assert controller.fault is not None, "nothing was granted"
+    controller.request(Mode.PASSIVE)
+    controller.step()
+    assert controller.fault is None
+
+
 def test_what_was_too_fast_before_a_fault_does_not_count_again(running: Running, bus: FakeBus) -> None:
     controller = running()
     bend(bus, joint_velocity=torch.full((12,), 31.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -103,6 +104,54 @@ def test_a_second_commander_and_the_remote_are_seen(robot: DDSRobot, monkeypatch
     monkeypatch.setattr(unitree, "to_low_state", pressed)  # the simulated robot has no remote control of its own
     assert until(lambda: one.read() is not None and one.other_commanders() == ("the remote control (L2 + B)",))
     one.close()
+
+
+def test_another_robot_is_no_news_of_the_first_and_is_named(robot: DDSRobot) -> None:
+    transport = DDSTransport(domain=DOMAIN, patience=60.0)
+    stranger = DDSRobot(SimulatedRobot(), domain=DOMAIN)
+    hip = constants.JOINT_NAMES.index("FL_hip_joint")
+    stranger.robot.data.qpos[7 + hip] = 0.7
+    seen: list[float] = []
+
+    def named() -> bool:
+        stranger.publish()
+        seen.append(float(transport.read().joint_position[hip]))
+        return transport.other_commanders() == (f"another robot on {unitree.STATE_TOPIC}",)
+
+    assert until(named)
+    for _ in range(50):
+        time.sleep(0.002)
+        named()
+    assert max(seen) < 0.6
+    stranger.close()
+    transport.close()
+
+
+def test_a_state_that_is_repeated_grows_old(dds: None) -> None:
+    silent = DDSRobot(SimulatedRobot(), domain=DOMAIN)
+    last_word = to_message(unitree.to_low_state(RobotState.standing()))
+    stop = threading.Event()
+
+    def repeat() -> None:
+        while not stop.wait(0.002):
+            silent._line.writer.write(last_word)
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    transport = DDSTransport(domain=DOMAIN, patience=60.0)
+    begun = time.monotonic()
+    assert until(lambda: transport.read().time < time.monotonic() - 0.2 or time.monotonic() > begun + 5.0)
+    assert transport.read().time <= begun
+    stop.set()
+    thread.join()
+    transport.close()
+    silent.close()
+
+
+def test_an_interface_that_cannot_be_used_is_named(dds: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "if_nameindex", lambda: [(9, "eth9")])  # one that was there a moment ago
+    with pytest.raises(ConnectionError, match=f"cannot join DDS domain {DOMAIN + 101} by the interface eth9: is it up"):
+        participant("eth9", DOMAIN + 101)
 
 
 def test_two_processes_and_a_robot_that_falls_silent(dds: None) -> None:

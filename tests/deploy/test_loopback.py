@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import threading
+import time
 from dataclasses import fields, replace
 
 import pytest
@@ -22,6 +24,8 @@ from agility_rl.deploy.loopback import (
     unpack_state,
     unseal,
 )
+from agility_rl.deploy.robot_process import RobotServer, in_real_time
+from agility_rl.deploy.simulated import SimulatedRobot
 from agility_rl.deploy.transport import JointCommand, RobotState
 
 
@@ -72,6 +76,27 @@ def test_commanders_are_forgotten() -> None:
     for session, now in ((1, 0.0), (2, 0.3), (1, 0.4)):
         commanders.heard(session, now)
     assert [commanders.count(now) for now in (0.4, 0.85, 1.0)] == [2, 1, 0]
+
+
+def test_who_has_fallen_silent_does_not_take_itself_for_alone() -> None:
+    server = RobotServer(SimulatedRobot())
+    stop = threading.Event()
+    thread = threading.Thread(target=in_real_time, args=(server,), kwargs={"stopped": stop.is_set})
+    thread.start()
+    driving, silent = LoopbackTransport(server.port), LoopbackTransport(server.port)
+    silent.send(JointCommand.damped(0.0))
+    end = time.monotonic() + 1.0
+    while time.monotonic() < end:
+        driving.send(JointCommand.damped(0.0))
+        time.sleep(0.01)
+        silent.read()
+    assert silent.other_commanders() == ("1 other program",)
+    driving.read()
+    assert driving.other_commanders() == ()
+    stop.set()
+    thread.join()
+    for end_of_line in (driving, silent, server):
+        end_of_line.close()
 
 
 def test_a_missing_robot_is_named() -> None:

@@ -71,6 +71,24 @@ def test_without_commands_the_motors_damp() -> None:
     assert float(robot.data.qpos[2]) < 0.2, "it has sunk down"
 
 
+@pytest.mark.parametrize("sim_dt", [0.001, 0.003, 0.005])
+def test_time_passes_as_it_should_whatever_the_physics_step(sim_dt: float) -> None:
+    robot = SimulatedRobot(sim_dt=sim_dt)
+    for call in range(1, 16):
+        robot.advance(0.002)
+        assert 0.002 * call - sim_dt < robot.time <= 0.002 * call + 1e-9
+    assert robot.time == pytest.approx(0.03)
+    robot.advance(0.001)
+    robot.reset()
+    robot.advance(sim_dt)
+    assert robot.time == pytest.approx(sim_dt), "what was owed is forgotten"
+
+
+def test_a_physics_step_that_is_none_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"a physics step above 0 s, got 0\.0"):
+        SimulatedRobot(sim_dt=0.0)
+
+
 def test_an_unknown_pose_is_named() -> None:
     with pytest.raises(ValueError, match="expected the pose standing or lying, got 'sitting'"):
         SimulatedRobot().reset("sitting")

@@ -130,11 +130,13 @@ def test_a_student_needs_a_camera(
     with pytest.raises(ValueError, match="expected --camera only with --task: nothing else looks"):
         deploy.main(deploy.Config(untrained, camera="mine:Eye", output=tmp_path / "run.mcap"))
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text("class Blind: ...\nclass Eye:\n    def latest(self): return None\n")
+    eye = "class Eye:\n    def latest(self): return None\n"
+    (tmp_path / "mine.py").write_text(f"class Blind: ...\n{eye}def Far(address): ...\n")
     load_camera = deploy.load_camera
     assert load_camera("mine:Eye").latest() is None
     for text, message in (
         ("mine:Blind", "mine:Blind made Blind, expected something with latest()"),
+        ("mine:Far", "missing 1 required positional argument: 'address'"),
         ("mine:Other", "expected MODULE:NAME of a class or function, got 'mine:Other'"),
         ("nowhere:Eye", "expected MODULE:NAME of a class or function, got 'nowhere:Eye'"),
         ("mine", "expected MODULE:NAME of a class or function, got 'mine'"),
@@ -176,9 +178,9 @@ def test_a_file_is_never_overwritten_and_a_bad_name_is_named(
         with pytest.raises(ValueError, match=r"a new file that ends in \.mcap"):
             deploy.main(deploy.Config(untrained, output=path))
     assert taken.read_bytes() == b"mine"
-    (tmp_path / "deploy_0.mcap").touch()
-    (tmp_path / ".deploy_1.mcap.incoming").touch()
-    assert deploy.free_file(tmp_path).name == "deploy_2.mcap", "a killed run's recording is left alone"
+    (tmp_path / ".killed.mcap.incoming").touch()
+    with pytest.raises(ValueError, match=r"a new file that ends in \.mcap"):
+        deploy.main(deploy.Config(untrained, output=tmp_path / "killed.mcap"))
     with pytest.raises(ValueError, match="'gallop' is no behaviour"):
         deploy.main(deploy.Config(untrained, skill="gallop"))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -136,6 +137,18 @@ def test_the_shipped_student_is_exported(export: ModuleType, repository: Path, t
     shifted = replace(exportable, expected=tuple(values + 2e-5 for values in exportable.expected))
     with pytest.raises(ArtifactError, match=r"differs from the training policy by .*, expected at most 1e-05"):
         export.check_network(shifted)
+
+
+def test_neither_another_artifact_nor_a_run_is_exported_over(
+    export: ModuleType, untrained: Path, repository: Path, tmp_path: Path
+) -> None:
+    other = shutil.copytree(repository / "pretrained" / "bbc", tmp_path / "other")
+    before = {path.name: path.stat().st_mtime_ns for path in other.iterdir()}
+    for folder in (other, untrained):
+        with pytest.raises(FileExistsError, match=f"--output {folder} holds another policy already"):
+            export.main(export.Config(untrained, output=folder, steps=2))
+    assert {path.name: path.stat().st_mtime_ns for path in other.iterdir()} == before
+    assert not (untrained / "manifest.json").exists()
 
 
 def test_steps_must_be_positive(export: ModuleType, untrained: Path) -> None:

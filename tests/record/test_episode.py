@@ -9,7 +9,7 @@ import torch
 from mcap.reader import make_reader
 
 from agility_rl.go2 import constants
-from agility_rl.record.episode import EpisodeRecorder, read_episode, read_metadata, write_episode
+from agility_rl.record.episode import EpisodeRecorder, free_file, is_free, read_episode, read_metadata, write_episode
 from agility_rl.record.messages import read_messages
 from agility_rl.record.scene import Shape
 
@@ -94,6 +94,13 @@ def test_the_name_is_taken_when_the_file_is_complete(tmp_path: Path, episode: di
     recorder.close()
     with pytest.raises(RuntimeError, match="is closed; make a new recorder"):
         recorder.record(torch.zeros(3), torch.tensor([1.0, 0, 0, 0]), torch.zeros(12))
+
+
+def test_a_name_is_free_that_no_recording_has_finished_or_begun(tmp_path: Path) -> None:
+    (tmp_path / "trot_0.mcap").touch()
+    with EpisodeRecorder(free_file(tmp_path, "trot")) as recorder:
+        assert recorder.path.name == "trot_1.mcap" and not is_free(recorder.path)
+        assert free_file(tmp_path, "trot").name == "trot_2.mcap", "beside it, another one may record"
 
 
 def test_two_recorders_may_have_the_same_group_with_other_names(tmp_path: Path) -> None:
