@@ -16,20 +16,20 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import bbc_presets
 import torch
-from bbc_presets import CPU
+from bbc_config import Config as TrainingConfig
 from rich.console import Console
 from rollouts import MotionConfig
 
 from agility_rl.behaviours import BEHAVIOURS
-from agility_rl.training import cli, metrics
+from agility_rl.training import cli, metrics, run_folder
 from agility_rl.training.checkpoint import RunCheckpoint
 
-WITHOUT_IMITATION = [change for change in CPU.changes if not change[1].startswith("imitation.")]
 VARIANTS: dict[str, tuple[str, ...]] = {
     "none": (),
     "labels_3_percent": ("--motion.label-share", "0.03"),
@@ -45,12 +45,11 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "task_only": (
         *("--imitation.imitation-reward", "0", "--imitation.skill-reward", "0", "--imitation.shift-reward", "0"),
         *("--imitation.cloning", "0", "--env.rhythm-weight", "0"),
-        *("--changes", *(str(part) for change in WITHOUT_IMITATION for part in change)),
     ),
 }
 """What each variant adds to the command. ``none`` lacks nothing; ``prior_raw`` draws skills from the learned prior as
 it is, which the preset makes almost even; ``no_labels`` looks at no clip's name, and ``task_only`` pays for commands
-and regularity alone, both from a random start."""
+and regularity alone and does without the preset's changes of the imitation, both from a random start."""
 
 
 @dataclass(frozen=True)
@@ -91,28 +90,49 @@ def motion_options(config: MotionConfig) -> list[str]:
     return [text for option, path in given.items() if path is not None for text in (option, str(path))]
 
 
+def options_of(variant: str, preset: str) -> list[str]:
+    """What a variant adds to the command."""
+    changes = bbc_presets.PRESETS[preset].changes if variant == "task_only" else ()
+    kept = [str(part) for change in changes if not change[1].startswith("imitation.") for part in change]
+    return [*VARIANTS[variant], *(["--changes", *kept] if changes else [])]
+
+
 def train(variant: str, seed: int, config: Config) -> Path:
-    """An evaluated run, made, resumed or found."""
+    """An evaluated run, made, resumed or found.
+
+    Raises:
+        ValueError: if it was made with other options than those asked for, or stopped.
+    """
     run = config.runs / f"ablation_{variant}_{seed}"
-    if (run / "evaluation.json").is_file():
+    options = ["--name", run.name, "--runs", str(config.runs), "--seed", str(seed)]
+    options += [*motion_options(config.motion), *options_of(variant, config.preset)]
+    asked = cli.from_presets(bbc_presets.PRESETS, [config.preset, *options])
+    asked = replace(asked, iterations=config.iterations or asked.iterations)
+    judged = {name: getattr(config, name) for name in ("episodes", "seconds", "switches")}
+    begun, finished = (run / run_folder.CONFIG_FILE).is_file(), (run / "evaluation.json").is_file()
+    if begun and (other := differences(run, asked, judged if finished else {})):
+        raise ValueError(f"{run} was made with other {', '.join(other)}; choose another --runs, or remove it")
+    if finished:
         return run
-    arguments = ["--max-minutes", "None"]  # alike are iterations, however busy the machine is
-    arguments += ["--iterations", str(config.iterations)] if config.iterations is not None else []
-    if (run / cli.CONFIG_FILE).is_file():
-        arguments += ["--resume", str(run)]
-    else:
-        arguments += ["--name", run.name, "--runs", str(config.runs), "--seed", str(seed)]
-        arguments += [*motion_options(config.motion), *VARIANTS[variant]]
-    command("bbc_pretrain", config.preset, *arguments)
-    wanted = (
-        config.iterations or json.loads((run / cli.CONFIG_FILE).read_text(encoding="utf-8"))["config"]["iterations"]
-    )
-    if (done := RunCheckpoint(run / "checkpoints").steps()[-1]) < wanted:
-        raise ValueError(f"{run} ended after {done} of {wanted} iterations; start this again to go on")
-    judged = {"--episodes": config.episodes, "--seconds": config.seconds, "--switches": config.switches}
-    options = [text for option, value in judged.items() for text in (option, str(value))]
-    command("evaluate", str(run), *motion_options(config.motion), *options)
+    limits = ["--iterations", str(asked.iterations), "--max-minutes", "None"]  # however busy the machine is
+    command("bbc_pretrain", config.preset, *limits, *(["--resume", str(run)] if begun else options))
+    if (done := RunCheckpoint(run / "checkpoints").steps()[-1]) < asked.iterations:
+        raise ValueError(f"{run} ended after {done} of {asked.iterations} iterations; start this again to go on")
+    judging = [text for name, value in judged.items() for text in (f"--{name}", str(value))]
+    command("evaluate", str(run), *motion_options(config.motion), *judging)
     return run
+
+
+def differences(run: Path, asked: TrainingConfig, judged: dict[str, Any]) -> list[str]:
+    """Which options of a run's training are others than those asked for; of a finished run, of its evaluation too."""
+    began = run_folder.read_config(run, TrainingConfig)
+    free = {"name", "runs", "resume", "max_minutes", "iterations"}
+    other = [name for name in vars(asked) if name not in free and getattr(began, name) != getattr(asked, name)]
+    if judged:
+        other += ["iterations"] if RunCheckpoint(run / "checkpoints").steps()[-1] != asked.iterations else []
+        found = json.loads((run / "evaluation.json").read_text(encoding="utf-8"))["settings"]
+        other += [name for name, value in judged.items() if found[name] != value]
+    return other
 
 
 def summary(run: Path) -> dict[str, Any]:
@@ -151,6 +171,8 @@ def main(config: Config, console: Console) -> dict[str, list[dict[str, Any]]]:
         raise ValueError(
             f"expected --seeds and --variants of {', '.join(VARIANTS)}; got {', '.join(unknown) or 'none'}"
         )
+    if config.preset not in bbc_presets.PRESETS:
+        raise ValueError(f"--preset: expected one of {', '.join(bbc_presets.PRESETS)}, got {config.preset!r}")
     file = config.runs / "ablations.json"
     rows: dict[str, list[dict[str, Any]]] = {}
     if file.is_file():
@@ -160,7 +182,7 @@ def main(config: Config, console: Console) -> dict[str, list[dict[str, Any]]]:
             found = summary(train(variant, seed, config))
             others = [row for row in rows.get(variant, []) if row["run"] != found["run"]]
             rows[variant] = sorted([*others, found], key=lambda row: row["run"])
-            cli.write_json(file, {"format": "agility_rl.ablations", "rows": rows})
+            run_folder.write_json(file, {"format": "agility_rl.ablations", "rows": rows})
             (config.runs / "ablations.md").write_text(table(rows), encoding="utf-8")
     console.print(table(rows), highlight=False)
     return rows

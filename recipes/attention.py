@@ -32,7 +32,7 @@ from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.modules import RecurrentStudent
 from agility_rl.modules.grad_cam import grad_cam
 from agility_rl.record.plots import new_figure, save_figure
-from agility_rl.training import cli, metrics
+from agility_rl.training import cli, metrics, run_folder
 
 DISTURBED = ("none", "rectangles", "noise", "blur", "dropout")
 """Columns: those of Fig. S2, and pixels that drop out."""
@@ -161,14 +161,14 @@ def attend(config: Config, console: Console) -> dict[str, Any]:
         "runs": [{"run": str(path), "label": label} for path, label in zip(config.runs, labels, strict=True)],
         "weights": [decider.weights for decider in deciders],
         "settings": config,
-        "versions": cli.versions(),
+        "versions": run_folder.versions(),
         "images": {name: count for name, count in zip(OBSTACLES, counts, strict=True) if count},
         "area_of_the_obstacle": interval(area),
         "groups": groups,
     }
     output = config.output or config.runs[0]
     output.mkdir(parents=True, exist_ok=True)
-    cli.write_json(output / "attention.json", to_json(result))
+    run_folder.write_json(output / "attention.json", to_json(result))
     candidates = (scenes.kind == list(OBSTACLES).index(config.obstacle)).nonzero()[:, 0]
     if len(candidates):
         example = int(candidates[area[candidates].argsort()[len(candidates) // 2]])  # of median size

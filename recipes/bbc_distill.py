@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
+import bbc_changes
 import bbc_config
 import torch
 from bbc_world import make_env
@@ -39,7 +40,7 @@ from agility_rl.go2 import constants, features
 from agility_rl.losses import AdaptationLoss, StateEstimationLoss
 from agility_rl.modules import BasicBehaviourController
 from agility_rl.motion import MotionDataset
-from agility_rl.training import cli
+from agility_rl.training import cli, run_folder
 from agility_rl.training.seeding import seed_everything
 
 Act = Callable[[TensorDictBase], Tensor]
@@ -210,9 +211,10 @@ def main(cfg: Config) -> Path:
     first = load_controller(cfg.teachers[0][1])
     bbc = first.bbc
     motion = load_motion(cfg.motion, first.trained, cfg.seed)
-    folder = cli.start_run(cfg, cfg.runs / cfg.name, recipe="bbc_distill")
     world = bbc_config.Config(env=replace(cfg.env, friction_loss=first.friction_loss))
+    bbc_changes.check(world)
     env = make_env(world, MotionDataset(motion.labelled, motion.labelled), seeds)
+    folder = run_folder.start_run(cfg, cfg.runs / cfg.name, recipe="bbc_distill")
     label, carrier = labeller(teachers, cfg.steered, dict(cfg.mirrored)), env.reset()
     optimizer = torch.optim.Adam(bbc.parameters(), lr=cfg.learning_rate)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, cfg.rounds)

@@ -24,7 +24,7 @@ import bbc_presets
 from bbc_config import MotionConfig
 from bbc_pretrain import train
 from evaluate import Config as Evaluation
-from evaluate import evaluate_behaviours
+from evaluate import check, evaluate_behaviours
 from judgement import to_json
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -33,7 +33,7 @@ from rollouts import MotionConfig as Clips
 from rollouts import load_controller, load_motion
 
 from agility_rl.behaviours import BEHAVIOURS
-from agility_rl.training import cli, metrics
+from agility_rl.training import cli, metrics, run_folder
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,19 @@ def training(cfg: Config) -> bbc_config.Config:
     )
 
 
+def evaluation(cfg: Config, path: Path, simulator: Path) -> Evaluation:
+    """How a controller is measured in a simulator."""
+    return Evaluation(
+        path,
+        episodes=cfg.episodes,
+        seconds=cfg.seconds,
+        seed=cfg.seed,
+        num_threads=cfg.num_threads,
+        simulator=simulator,
+        switches=0,
+    )
+
+
 def compare(cfg: Config, run: Path, console: Console) -> dict[str, Any]:
     """Measure the controllers before and after in the identified simulator, and in the target if it is known."""
     assert cfg.init_from is not None and cfg.simulator is not None
@@ -122,15 +135,7 @@ def compare(cfg: Config, run: Path, console: Console) -> dict[str, Any]:
     for place, simulator in places.items():
         for stage, path in (("before", cfg.init_from), ("after", run)):
             controller = load_controller(path)
-            options = Evaluation(
-                path,
-                episodes=cfg.episodes,
-                seconds=cfg.seconds,
-                seed=cfg.seed,
-                num_threads=cfg.num_threads,
-                simulator=simulator,
-                switches=0,
-            )
+            options = evaluation(cfg, path, simulator)
             figures = run / "figures" / f"{place}_{stage}"
             found = evaluate_behaviours(controller, options, motion, states, figures)
             result.setdefault(place, {})[stage] = found
@@ -160,17 +165,22 @@ def main(cfg: Config, console: Console | None = None) -> Path:
     """Fine-tune, then compare; returns the run folder."""
     console = console or cli.console(120)
     if cfg.resume is not None:
-        own = cli.read_config(cfg.resume, bbc_config.Config)
+        own, asked = run_folder.read_config(cfg.resume, bbc_config.Config), cfg
         cfg = replace(cfg, init_from=own.init_from, simulator=own.env.simulator, motion=own.motion, seed=own.seed)
-        cfg = replace(cfg, iterations=cfg.iterations or own.iterations)
+        cfg = replace(cfg, iterations=cfg.iterations or own.iterations, anchor=own.imitation.anchor)
         if own.init_from is None or own.env.simulator is None:
             raise ValueError(f"{cfg.resume} is no run of bbc_finetune.py: resume it with its own recipe")
+        if unheeded := cli.unheeded(asked, cfg):
+            print(f"{cfg.resume} goes on with the options that it began with; not heeded: {', '.join(unheeded)}")
     if cfg.init_from is None or cfg.simulator is None:
         raise ValueError("give --init-from RUN, the BBC to fine-tune, and --simulator RUN, what easi.py found")
+    if cfg.iterations is not None and cfg.iterations < 1:
+        raise ValueError(f"--iterations: expected at least 1, got {cfg.iterations}")
     if cfg.target is not None and not cfg.target.is_file():
         raise FileNotFoundError(f"--target {cfg.target}: no such file; record_log.py writes NAME.truth.json")
+    check(evaluation(cfg, cfg.init_from, cfg.simulator))
     run = train(training(cfg))
-    cli.write_json(run / "comparison.json", to_json(compare(cfg, run, console)))
+    run_folder.write_json(run / "comparison.json", to_json(compare(cfg, run, console)))
     console.print(f"saved {run / 'comparison.json'}", markup=False)
     return run
 

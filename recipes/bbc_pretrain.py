@@ -32,7 +32,7 @@ from bbc_world import set_boxes
 from held_fixed import fit, infer
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import Laps, own_options, policy_to_start_from, run, run_folder
+from training_run import KEPT, Laps, folder_of, own_options, policy_to_start_from, run
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
@@ -269,11 +269,11 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     metrics["falls_per_minute"] = batch["next", "terminated"].float().mean() * 60.0 / parts.env.dt
     numbers = {name: float(value) for name, value in metrics.items()}
     if due(cfg, iteration + 1):
-        numbers |= hold_trial(cfg, run_folder(cfg), iteration + 1, partial(save_policy, parts, cfg))
+        numbers |= hold_trial(cfg, folder_of(cfg), iteration + 1, partial(save_policy, parts, cfg))
         lap("trial")
     return numbers | lap.metrics
 
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        train(cli.from_presets(PRESETS, doc=__doc__))
+        train(cli.from_presets(PRESETS, doc=__doc__, kept=KEPT))

@@ -19,7 +19,7 @@ from torch.optim.swa_utils import AveragedModel
 from torchrl.data import LazyTensorStorage
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR
 from torchrl.objectives.value import GAE
-from training_run import policy_to_start_from, run_folder
+from training_run import check_began_with, folder_of, policy_to_start_from
 
 from agility_rl import keys
 from agility_rl.behaviours import BEHAVIOURS
@@ -45,6 +45,8 @@ from agility_rl.training.seeding import Seeds, seed_everything
 
 ANCHORED = "anchored_action"
 """Mean action of the anchor, float32 ``[T, N, 12]``, in collected experience."""
+ANCHOR = "anchored_to"
+"""Under which the manifest names the anchor's weights."""
 
 
 @dataclass
@@ -58,6 +60,8 @@ class Components:
     bbc: BasicBehaviourController
     averaged: AveragedModel | None
     anchor: BasicBehaviourController | None
+    anchored_to: str | None
+    """SHA-256 of the anchor's weights."""
     critic: Critic
     discriminator: Discriminator
     predictor: Predictor
@@ -101,12 +105,15 @@ def build(cfg: Config) -> Components:
     dataset = load_dataset(cfg.motion, cfg.seed).to(device)
     env = make_env(cfg, dataset, seeds)
     bbc = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std).to(device)
-    anchor = None
+    anchor = anchored_to = None
     if im.anchor:
         if cfg.init_from is None:
             raise ValueError("--imitation.anchor holds on to the policy of --init-from RUN; give both or neither")
         anchor = BasicBehaviourController(ppo.hidden, ppo.initial_std, ppo.min_std).to(device).requires_grad_(False)
-        policy_to_start_from(cfg.init_from, "bbc", ppo.hidden).fill(anchor)
+        start = policy_to_start_from(cfg.init_from, "bbc", ppo.hidden)
+        anchored_to = start.manifest["weights"]["sha256"]
+        check_began_with(cfg.resume, ANCHOR, anchored_to, cfg.init_from)
+        start.fill(anchor)
     critic_keys = [keys.PROPRIOCEPTION, keys.EXPLICIT, keys.PRIVILEGED, keys.COMMAND, keys.PEAK]
     critic_keys += [keys.HISTORY] if ppo.critic_history else []
     # Who is not told of what lies in the way judges a robot only when it stumbles.
@@ -184,6 +191,7 @@ def build(cfg: Config) -> Components:
         bbc=bbc,
         averaged=moving_average(bbc, ppo.averaging),
         anchor=anchor,
+        anchored_to=anchored_to,
         critic=critic,
         discriminator=discriminator,
         predictor=predictor,
@@ -235,7 +243,7 @@ def build(cfg: Config) -> Components:
 
 def provenance(cfg: Config) -> list[str]:
     """What motion the controller has learned from: that of the policy that it started from, and of this run."""
-    saved_before = run_folder(cfg) / "policy"  # by the run itself, once the policy of --init-from may be gone
+    saved_before = folder_of(cfg) / "policy"  # by the run itself, once the policy of --init-from may be gone
     start = saved_before if (saved_before / MANIFEST_FILE).is_file() else cfg.init_from
     before = [] if start is None else Artifact.load(start, kind="bbc").manifest.get("data", [])
     clips = [clip for clip in (cfg.motion.labelled, cfg.motion.unlabelled) if clip]
@@ -250,6 +258,7 @@ def save_policy(parts: Components, cfg: Config, folder: Path) -> None:
     manifest |= {"network": parts.bbc.settings, "prior": parts.prior.probabilities.tolist()}
     friction = parts.env.simulator.parameter("friction_loss").mean().item()  # an identified one has its own
     manifest["simulation"] = {"friction_loss": round(friction, 6)}
+    manifest |= {} if parts.anchored_to is None else {ANCHOR: parts.anchored_to}
     Artifact.save(folder / "policy", saved(parts.bbc, parts.averaged).state_dict(), manifest)
     layouts = {"motion": features.MOTION_LAYOUT}
     manifest = build_manifest("discriminator", layouts, control_period=parts.env.dt, data=data)

@@ -42,6 +42,8 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
     reference = starts(dataset, seeds.generator("reference"), named=cfg.motion.label_share != 0.0)
     terrain = make_terrain(cfg.env, torch.Generator().manual_seed(seeds.integer("terrain")))
     randomization = Randomization() if cfg.env.randomize else NOMINAL if cfg.env.action_delay else None
+    if randomization is not None and not cfg.env.action_delay_from:
+        randomization = replace(randomization, action_delay=(cfg.env.action_delay, cfg.env.action_delay))
     model: dict[str, Any] = {"friction_loss": cfg.env.friction_loss}
     if cfg.env.simulator is not None:
         simulator = load_simulator(cfg.env.simulator)
@@ -69,6 +71,8 @@ def make_env(cfg: Config, dataset: MotionDataset, seeds: Seeds) -> LocomotionEnv
         seed=seeds.integer("environment"),
     )
     set_boxes(env, cfg.env)
+    if cfg.env.shares:
+        env.set_skill_probabilities(torch.tensor(cfg.env.shares))
     return env
 
 

@@ -32,7 +32,7 @@ from rich.progress import Progress
 from tsc_setup import course_of
 
 from agility_rl.record.plots import new_figure, save_figure
-from agility_rl.training import cli, metrics
+from agility_rl.training import cli, metrics, run_folder
 
 GROUPS = {True: "with BYOL", False: "without BYOL"}
 OF_TEACHER, HALVED = 0.9, 0.5
@@ -178,7 +178,7 @@ def compare(config: Config, console: Console) -> dict[str, Any]:
         "course": config.course,
         "episodes": config.episodes,
         "settings": config,
-        "versions": cli.versions(),
+        "versions": run_folder.versions(),
         "runs": found,
         "teacher": None,
         "complete": False,
@@ -209,10 +209,10 @@ def compare(config: Config, console: Console) -> dict[str, Any]:
             found[name] = entry | {"successes": {}, "obstacles": {}}
             for key, disturbance in disturbances.items():
                 found[name]["successes"][key], found[name]["obstacles"][key] = count(student, disturbance)
-                cli.write_json(config.output / "student_comparison.json", to_json(result))
+                run_folder.write_json(config.output / "student_comparison.json", to_json(result))
     beside = None if result["teacher"] is None else result["teacher"]["successes"]
     result |= conclude(found, beside, config.episodes) | {"complete": True, "seconds": time.monotonic() - begin}
-    cli.write_json(config.output / "student_comparison.json", to_json(result))
+    run_folder.write_json(config.output / "student_comparison.json", to_json(result))
     figure = bars(result["groups"], disturbances)
     save_figure(figure, config.output / "figures" / "success_under_disturbance.png")
     print_comparison(result, disturbances, console)

@@ -48,7 +48,7 @@ from agility_rl.deploy.operator import Operation, SharedControl
 from agility_rl.go2.appearance import dress
 from agility_rl.go2.model import build_spec
 from agility_rl.record import EpisodeRecorder, free_file, is_free
-from agility_rl.training import cli
+from agility_rl.training import cli, run_folder
 
 SINK_SECONDS = 1.5
 """Time for which damping is still commanded at the end, while the robot sinks down."""
@@ -171,7 +171,7 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
     metadata = {
         "weights": bbc.manifest["weights"]["sha256"],
         "robot": {"transport": cfg.transport, "real": cfg.real, **robot_options},
-        "versions": cli.versions(),
+        "versions": run_folder.versions(),
     }
     limits = SafetyLimits.from_manifest(
         bbc.manifest,

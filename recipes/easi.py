@@ -17,10 +17,11 @@ Presets: ``smoke`` (seconds), ``cpu`` (two cores, ours), ``paper`` (Table S3).
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import easi_config
 import torch
 from easi_config import PRESETS, Config, CriticConfig, check, check_inputs, least_std, replay_window, replayed_at_once
 from easi_report import (
@@ -33,10 +34,12 @@ from easi_report import (
     survivor_correlation,
     write_result,
 )
+from identified import known_fields
 from log_policy import Actor, checksum, make_actor
 from rich.console import Console
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from training_run import own_options
 
 from agility_rl.collectors import (
     EASICollector,
@@ -54,7 +57,7 @@ from agility_rl.losses import TransitionDiscriminatorLoss
 from agility_rl.modules import TransitionDiscriminator
 from agility_rl.record import MCAPLogger, read_scalars
 from agility_rl.simulation import Simulator, make_simulator
-from agility_rl.training import cli
+from agility_rl.training import cli, run_folder
 from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.display import Display
 from agility_rl.training.seeding import Seeds, seed_everything
@@ -96,7 +99,6 @@ def build(cfg: Config) -> Components:
     seeds, search = seed_everything(cfg.seed), cfg.search
     log = RobotLog.load(path)
     linear = {"scale": "linear"} if search.scale == "linear" else {}
-    space = ParameterSpace([Parameter.named(name, span=search.span, **linear) for name in search.parameters])
     actor = make_actor(cfg.policy, cfg.behaviours, cfg.command_seconds)
     recording = {
         "policy": actor.name,
@@ -106,6 +108,9 @@ def build(cfg: Config) -> Components:
         "noise": cfg.noise,
         "latency": cfg.latency,
     }
+    space = ParameterSpace(
+        [Parameter.named(name, span=search.span, **linear) for name in search.parameters], base=known_fields(recording)
+    )
     truth = None
     if cfg.truth is not None:
         truth, recorded = load_truth(cfg.truth, space)
@@ -243,15 +248,12 @@ def next_mean(parts: Components, individuals: Tensor, transitions: TensorDictBas
 def train(cfg: Config, console: Console | None = None) -> Path:
     """Algorithm S2; returns the run folder."""
     console = console or cli.console(120)
-    if cfg.resume is not None:  # a run goes on with its own options; only how long and how fast may change
-        own = cli.read_config(cfg.resume, Config)
-        changed = {name: getattr(cfg, name) for name in ("resume", "generations", "max_minutes", "num_threads")}
-        cfg = replace(own, **changed)
+    cfg = own_options(cfg, easi_config.KEPT)
     parts = build(cfg)
     if cfg.resume is not None:
         check_inputs(cfg.resume, parts.inputs)
     folder = cfg.resume or cfg.runs / cfg.name
-    folder = cli.start_run(cfg, folder, resume=cfg.resume is not None, recipe="easi", inputs=parts.inputs)
+    folder = run_folder.start_run(cfg, folder, resume=cfg.resume is not None, recipe="easi", inputs=parts.inputs)
     progress = {"generation": 0, "minutes": 0.0}
     checkpoint = parts.checkpoint(folder / "checkpoints", progress)
     if cfg.resume is not None and checkpoint.steps():
@@ -288,4 +290,4 @@ def train(cfg: Config, console: Console | None = None) -> Path:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        train(cli.from_presets(PRESETS, doc=__doc__))
+        train(cli.from_presets(PRESETS, doc=__doc__, kept=easi_config.KEPT))

@@ -38,10 +38,11 @@ from easi_report import load_truth, relative_error
 from easi_table import markdown, print_table, summarize
 from log_policy import make_actor
 from rich.console import Console
+from training_run import own_options
 
 from agility_rl.collectors import GAINS, ParameterSpace, RobotLog, cut_windows
 from agility_rl.collectors.parameters import Parameter
-from agility_rl.training import cli
+from agility_rl.training import cli, run_folder
 from agility_rl.training.seeding import Seeds
 
 TARGET_SPAN = 3.0
@@ -60,6 +61,8 @@ class Condition:
     """First range of the search, [1/span, span] x nominal."""
 
 
+KEPT = ("targets", "conditions", "methods")
+"""Options that may change when a comparison is resumed."""
 CONDITIONS = {
     "clean": Condition(),
     "noisy": Condition(noise=1.0, latency=1),
@@ -192,7 +195,7 @@ def compare_on(cfg: Config, folder: Path, index: int, name: str, console: Consol
             "steps": outcome.steps,
             "seconds": outcome.seconds,
         }
-        cli.write_json(file, result)
+        run_folder.write_json(file, result)
         console.print(
             f"{name}, target {index}, {method}: mean error {100 * float(error.mean()):.1f} %, {outcome.steps:,} "
             f"control steps, {outcome.seconds:.0f} s"
@@ -209,12 +212,10 @@ def all_results(folder: Path) -> list[dict[str, Any]]:
 def main(cfg: Config, console: Console | None = None) -> Path:
     """Compare on all targets, print and write the table; returns the run folder."""
     console = console or cli.console(160)
-    if cfg.resume is not None:
-        own = cli.read_config(cfg.resume, Config)
-        changed = {name: getattr(cfg, name) for name in ("resume", "targets", "conditions", "methods")}
-        cfg = replace(own, **changed)
+    cfg = own_options(cfg, KEPT)
     check(cfg)
-    folder = cli.start_run(
+    make_actor(cfg.easi.policy, cfg.easi.behaviours, cfg.easi.command_seconds)  # if it cannot be, the name stays free
+    folder = run_folder.start_run(
         cfg, cfg.resume or cfg.runs / cfg.name, resume=cfg.resume is not None, recipe="easi_baselines"
     )
     with cli.interruptible() as interrupted:
@@ -226,7 +227,7 @@ def main(cfg: Config, console: Console | None = None) -> Path:
     results = all_results(folder)
     methods = dict.fromkeys([*cfg.methods, *(method for result in results for method in result["methods"])])
     summary = summarize(results, list(methods))
-    cli.write_json(folder / "table.json", cli.to_json(summary))
+    run_folder.write_json(folder / "table.json", run_folder.to_json(summary))
     (folder / "table.md").write_text(markdown(summary), encoding="utf-8")
     print_table(console, summary)
     console.print(f"saved {folder}", markup=False)
@@ -235,4 +236,4 @@ def main(cfg: Config, console: Console | None = None) -> Path:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        main(cli.from_presets(PRESETS, doc=__doc__))
+        main(cli.from_presets(PRESETS, doc=__doc__, kept=KEPT))

@@ -10,11 +10,12 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
 
 from agility_rl.collectors import GAINS
-from agility_rl.training import cli
+from agility_rl.training import run_folder
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,8 @@ SMOKE = replace(
 )
 PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}
 
+KEPT = ("generations", "max_minutes", "num_threads")
+"""Options that may change when a search is resumed."""
 REPLAY_WINDOWS = {"exact": (1, 0), "noisy": (8, 2)}
 """Steps and skipped steps of a replayed window. With exact start states the first step says most, and later ones only
 add what the estimated trunk velocity gets wrong; a start state that was smoothed out of noise needs some steps to be
@@ -189,8 +192,9 @@ def check(cfg: Config) -> Path:
             raise ValueError(
                 f"--{option} needs --collection replay: a roll-out of the policy has no matching transition"
             )
-    if cfg.generations < 1 or cfg.trajectory_length < 1 or cfg.critic.updates < 1:
-        raise ValueError("expected --generations, --trajectory-length and --critic.updates from 1")
+    counts = ("generations", "trajectory_length", "checkpoint_every", "critic.updates", "critic.batch_per_robot")
+    if too_few := [name for name in counts if attrgetter(name)(cfg) < 1]:
+        raise ValueError(f"expected --{too_few[0].replace('_', '-')} of at least 1, got {attrgetter(too_few[0])(cfg)}")
     if cfg.noise < 0.0 or cfg.latency < 0:
         raise ValueError(f"expected --noise and --latency from 0, got {cfg.noise} and {cfg.latency}")
     steps, _ = replay_window(cfg)
@@ -205,7 +209,7 @@ def check_inputs(run: Path, inputs: dict[str, Any]) -> None:
     Raises:
         ValueError: naming what changed.
     """
-    began = json.loads((run / cli.CONFIG_FILE).read_text(encoding="utf-8")).get("inputs", {})
+    began = json.loads((run / run_folder.CONFIG_FILE).read_text(encoding="utf-8")).get("inputs", {})
     for name, value in inputs.items():
         if began.get(name) != value:
             raise ValueError(f"{run} began with {name} {began.get(name)}, found {value}; resume with the same one")

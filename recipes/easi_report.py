@@ -18,7 +18,7 @@ from torch import Tensor
 
 from agility_rl.collectors import EvolutionStrategy, ParameterSpace
 from agility_rl.record.plots import Curves, save_figure
-from agility_rl.training.cli import to_json, write_json
+from agility_rl.training.run_folder import to_json, write_json
 
 TRIES, UNLUCKY = 60, 0.1
 """Searches in which one parameter has no effect, and the share of its spreads there that a parameter must stay below:

@@ -44,7 +44,7 @@ from agility_rl.motion.gait_analysis import (
     stance_share,
 )
 from agility_rl.record.plots import behaviour_matrix, save_figure
-from agility_rl.training import cli, metrics
+from agility_rl.training import cli, metrics, run_folder
 
 COLUMNS = (*GAIT_LABELS, "fall")
 FALL = COLUMNS.index("fall")
@@ -246,8 +246,12 @@ def evaluate_prior(prior: list[float], clips: list[MotionClip]) -> dict[str, Any
     }
 
 
-def evaluate(config: Config, console: Console) -> dict[str, Any]:
-    """The whole evaluation; writes it and returns it."""
+def check(config: Config) -> None:
+    """Refuse an evaluation that cannot be.
+
+    Raises:
+        ValueError: naming the options.
+    """
     if config.episodes < 1 or config.robots < 1 or config.switches < 0:
         raise ValueError("expected --episodes and --robots of at least 1 and --switches of at least 0")
     if config.settle < 0 or config.seconds < config.settle + 1.0 or (config.switches and config.switch_seconds < 1.0):
@@ -256,6 +260,11 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         )
     if config.simulator is not None and config.randomize:
         raise ValueError("--randomize: a simulator of --simulator has its own parameters; give one of the two")
+
+
+def evaluate(config: Config, console: Console) -> dict[str, Any]:
+    """The whole evaluation; writes it and returns it."""
+    check(config)
     begin = time.monotonic()
     controller = load_controller(config.run)
     motion = load_motion(config.motion, controller.trained, config.seed)
@@ -272,12 +281,12 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         "weights": controller.artifact.manifest["weights"]["sha256"],
         "motion": {"source": motion.source, "synthetic": motion.synthetic},
         "settings": config,
-        "versions": cli.versions(),
+        "versions": run_folder.versions(),
         **found,
         "targets": targets(found),
         "seconds": time.monotonic() - begin,
     }
-    cli.write_json(output / "evaluation.json", to_json(result))
+    run_folder.write_json(output / "evaluation.json", to_json(result))
     print_evaluation(result, console)
     console.print(f"{output / 'evaluation.json'} and figures written after {result['seconds']:.0f} s", highlight=False)
     return result

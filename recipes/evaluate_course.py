@@ -50,7 +50,7 @@ from agility_rl.envs.randomization import NOMINAL
 from agility_rl.go2.constants import CONTROL_DT
 from agility_rl.record.course_plots import behaviour_use, plan_view
 from agility_rl.record.plots import save_figure
-from agility_rl.training import cli
+from agility_rl.training import cli, run_folder
 
 GROUPS = {"each": CHALLENGE, "targets": ("full", *CHALLENGE, "box", "hurdles")}
 """Names that stand for several courses; the second holds all that stage 3 has a target for."""
@@ -227,12 +227,12 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
         "behaviours": decider.behaviours,
         "fastest_canter": decider.fastest_canter,
         "settings": config,
-        "versions": cli.versions(),
+        "versions": run_folder.versions(),
         "courses": found,
         "targets": targets(found, decider.kind),
         "seconds": time.monotonic() - begin,
     }
-    cli.write_json(output / "course_evaluation.json", to_json(result))
+    run_folder.write_json(output / "course_evaluation.json", to_json(result))
     print_courses(result, console)
     console.print(
         f"{output / 'course_evaluation.json'} and figures written after {result['seconds']:.0f} s", highlight=False

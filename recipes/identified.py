@@ -14,6 +14,7 @@ from torch import Tensor
 from agility_rl.collectors import ParameterSpace
 from agility_rl.collectors.parameters import Parameter
 from agility_rl.envs.randomization import NOMINAL, Randomization
+from agility_rl.go2.constants import NUM_JOINTS
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,9 @@ def load_simulator(path: Path) -> SimulatorFile:
 
 
 def _found(content: Mapping[str, Any], parameters: Mapping[str, Any]) -> SimulatorFile:
-    search = content["search"]
-    space = ParameterSpace([Parameter.named(name, **search["ranges"][name]) for name in parameters])
+    search, model = content["search"], content.get("model", {})
+    named = [Parameter.named(name, **search["ranges"][name]) for name in parameters]
+    space = ParameterSpace(named, base=known_fields(model))
     mean = torch.tensor(search["mean"], dtype=torch.float64)
     values, vectors = torch.linalg.eigh(torch.tensor(search["covariance"], dtype=torch.float64))
     root = vectors * values.clamp_min(0.0).sqrt()
@@ -81,17 +83,23 @@ def _found(content: Mapping[str, Any], parameters: Mapping[str, Any]) -> Simulat
         normal = torch.randn(shape, generator=generator, dtype=torch.float64, device=device).cpu()
         return _there(space.fields(space.denormalize(mean + normal @ root.mT)), device)
 
-    return SimulatorFile(draw, content.get("model", {}), _describe(parameters, "mean"))
+    return SimulatorFile(draw, model, _describe(parameters, "mean"))
 
 
 def _truth(content: Mapping[str, Any], parameters: Mapping[str, Any]) -> SimulatorFile:
-    space = ParameterSpace(tuple(parameters))
+    model = dict(content["recording"]["model"])
+    space = ParameterSpace(tuple(parameters), base=known_fields(model))
     values = torch.tensor([[float(entry["value"]) for entry in parameters.values()]], dtype=torch.float64)
 
     def draw(count: int, generator: torch.Generator) -> dict[str, Tensor]:
         return _there(space.fields(values.expand(count, -1)), generator.device)
 
-    return SimulatorFile(draw, dict(content["recording"]["model"]), _describe(parameters, "value"))
+    return SimulatorFile(draw, model, _describe(parameters, "value"))
+
+
+def known_fields(model: Mapping[str, Any]) -> dict[str, list[float]]:
+    """What joints have that no parameter of a space sets: the dry friction of the model, if it says one."""
+    return {"friction_loss": [model["friction_loss"]] * NUM_JOINTS} if "friction_loss" in model else {}
 
 
 def _there(fields: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:

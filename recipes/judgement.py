@@ -16,7 +16,7 @@ from torch import Tensor
 from agility_rl.behaviours import BEHAVIOURS, JUMP
 from agility_rl.go2.constants import CONTROL_DT
 from agility_rl.record.plots import footfall_diagram, save_figure, tracking_plot
-from agility_rl.training import cli, metrics
+from agility_rl.training import metrics, run_folder
 
 SPEED_LIMIT = {"walk": 0.2, "pace": 0.2, "trot": 0.2, "canter": 0.35, "jump": 0.35}
 PRIOR_LIMIT = 0.15
@@ -153,7 +153,7 @@ def to_json(value: Any) -> Any:
         return [to_json(item) for item in value]
     if isinstance(value, float):
         return round(value, 6) if math.isfinite(value) else None
-    return cli.to_json(value)
+    return run_folder.to_json(value)
 
 
 def make_table(title: str, *columns: str) -> Table:

@@ -26,7 +26,7 @@ from log_policy import make_actor
 from agility_rl.collectors import GAINS, ParameterSpace, RobotLog, record_robot_log
 from agility_rl.collectors.log_formats import SUFFIXES
 from agility_rl.simulation import make_simulator
-from agility_rl.training import cli
+from agility_rl.training import cli, run_folder
 from agility_rl.training.seeding import seed_everything
 
 
@@ -149,8 +149,8 @@ def main(cfg: Config) -> Path:
         "latency": cfg.latency,
         "model": model,
     }
-    record = {"parameters": truth, "recording": recording, "config": cfg, "versions": cli.versions()}
-    cli.write_json(truth_file, cli.to_json(record))
+    record = {"parameters": truth, "recording": recording, "config": cfg, "versions": run_folder.versions()}
+    run_folder.write_json(truth_file, run_folder.to_json(record))
     falls = int(RobotLog.load(cfg.log).start.sum()) - 1
     print(f"{cfg.log}: {len(log)} rows, {len(log) * log.control_dt:.0f} s, put back {falls} times after a fall")
     print(

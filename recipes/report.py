@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.record import read_scalars
 from agility_rl.record.plots import Curves, learning_curves
-from agility_rl.training import cli
+from agility_rl.training import cli, run_folder
 from agility_rl.training.checkpoint import publish
 
 COURSE = "course"
@@ -63,6 +63,13 @@ def read_json(path: Path) -> dict[str, Any] | None:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path} is damaged: {error}; make it again") from error
+
+
+def outdated(weights: str | None, evaluations: Mapping[str, Any]) -> list[str]:
+    """Notes on evaluations, by recipe, of other weights than those that a run shows now."""
+    text = "an earlier policy of this run was evaluated: run recipes/{}.py on it again"
+    others = [recipe for recipe, found in evaluations.items() if found and found.get("weights", weights) != weights]
+    return [note(text.format(recipe)) for recipe in others if weights]
 
 
 def results(found: Mapping[str, Any], figures: Path) -> str:
@@ -175,11 +182,11 @@ def page(run: Path) -> str:
     Raises:
         FileNotFoundError: if the folder is no run.
     """
-    record, found = read_json(run / cli.CONFIG_FILE), read_json(run / "evaluation.json")
+    record, found = read_json(run / run_folder.CONFIG_FILE), read_json(run / "evaluation.json")
     courses = {folder: read_json(folder / "course_evaluation.json") for folder in (run, run / COURSE)}
     manifest = read_json(run / "policy" / "manifest.json") or {}
     if record is None and found is None and not any(courses.values()):
-        files = f"{cli.CONFIG_FILE}, evaluation.json or course_evaluation.json"
+        files = f"{run_folder.CONFIG_FILE}, evaluation.json or course_evaluation.json"
         raise FileNotFoundError(f"{run}: expected a run folder with {files}; check the path")
     record = record or {}
     if (recipe := record.get("recipe", "")).startswith("easi"):
@@ -189,11 +196,9 @@ def page(run: Path) -> str:
     parts = [f"<h1>{escape(run.resolve().name)}</h1>"]
     origin = [record.get("recipe"), record.get("started"), " ".join(record.get("command", []))]
     parts.append(note(" · ".join(str(entry) for entry in origin if entry)))
+    parts += outdated(manifest.get("weights", {}).get("sha256"), {"evaluate": found, "evaluate_course": courses[run]})
     if found:
         parts.append(results(found, run / "figures"))
-        shown = manifest.get("weights", {}).get("sha256")
-        if shown and found.get("weights", shown) != shown:
-            parts.append(note("an earlier policy of this run was evaluated: run recipes/evaluate.py on it again"))
     if (run / "comparison.json").is_file():
         parts.append(note("the controller before and after fine-tuning: comparison.json, beside this page"))
     parts += [course_results(course, folder / "figures") for folder, course in courses.items() if course]

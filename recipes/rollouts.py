@@ -116,9 +116,12 @@ def load_motion(config: MotionConfig, trained: Mapping[str, Any], seed: int) -> 
         raise ValueError("--motion.unlabelled needs --motion.labelled too: episodes start from labelled clips")
     if labelled is None and "labelled" in known and known["labelled"].is_dir():
         labelled, unlabelled = known["labelled"], known.get("unlabelled")
+        if unlabelled is not None and not unlabelled.exists():
+            print(f"{unlabelled}, the unlabelled motion of the training, is gone: the prior is compared with nothing")
+            unlabelled = None
     if labelled is None:
         return Motion(*synthetic_dataset_clips(seed), "synthetic gaits of agility_rl: no dog moved like this", True)
-    rest = load_clips(unlabelled) if unlabelled is not None and unlabelled.exists() else []
+    rest = [] if unlabelled is None else load_clips(unlabelled)
     return Motion(load_clips(labelled, label="from name"), rest, "/".join(labelled.resolve().parts[-2:]), False)
 
 

@@ -38,7 +38,7 @@ from agility_rl.deploy.behaviour import torch_network
 from agility_rl.deploy.safety import Safety, pd_torque
 from agility_rl.deploy.simulated import SimulatedRobot
 from agility_rl.go2 import constants
-from agility_rl.training import cli
+from agility_rl.training import cli, run_folder
 
 STAND_SECONDS = 1.0
 """Time for which the robot stands before it is told to move [s]."""
@@ -215,9 +215,13 @@ def main(cfg: Config, console: Console | None = None) -> dict[float, dict[str, F
     console.print(f"{len(cfg.steps) * len(skill)} episodes in {time.monotonic() - begin:.0f} s", highlight=False)
     if cfg.output is not None:
         by_name = {f"{1e3 * dt:g} ms": rows for dt, rows in found.items()}
-        settings = {"settings": cfg, "weights": artifact.manifest["weights"]["sha256"], "versions": cli.versions()}
+        settings = {
+            "settings": cfg,
+            "weights": artifact.manifest["weights"]["sha256"],
+            "versions": run_folder.versions(),
+        }
         cfg.output.parent.mkdir(parents=True, exist_ok=True)
-        cli.write_json(cfg.output, to_json({**settings, "physics steps": by_name}))
+        run_folder.write_json(cfg.output, to_json({**settings, "physics steps": by_name}))
     return found
 
 

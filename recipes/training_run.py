@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 from agility_rl.deploy.artifact import MANIFEST_FILE, Artifact, ArtifactError
 from agility_rl.record import MCAPLogger
 from agility_rl.simulation import simulator_device
-from agility_rl.training import cli, distributed
+from agility_rl.training import cli, distributed, run_folder
 from agility_rl.training.checkpoint import RunCheckpoint
 from agility_rl.training.display import Display
 
@@ -65,24 +65,29 @@ class Parts(Protocol):
 
 C = TypeVar("C", bound=RunConfig)
 P = TypeVar("P", bound=Parts)
+R = TypeVar("R")
+KEPT = ("iterations", "max_minutes")
+"""Options that may change when a training is resumed."""
 
 
-def own_options(cfg: C) -> C:
-    """Those with which a run that is resumed began; only how long it goes on may change."""
-    if cfg.resume is None:
+def own_options(cfg: R, kept: Sequence[str] = KEPT) -> R:
+    """Those with which a run that is resumed began; only some may change, such as how long it goes on."""
+    run: Path | None = cfg.resume  # type: ignore[attr-defined]
+    if run is None:
         return cfg
-    kept = {"resume": cfg.resume, "iterations": cfg.iterations, "max_minutes": cfg.max_minutes}
-    own: C = replace(cli.read_config(cfg.resume, type(cfg)), **kept)  # type: ignore[type-var]
-    unheeded = ", ".join(cli.unheeded(cfg, own))
+    changed = {name: getattr(cfg, name) for name in ("resume", *kept)}
+    own: R = replace(run_folder.read_config(run, type(cfg)), **changed)  # type: ignore[type-var]
     if distributed.rank() == 0:
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in kept)
+        unheeded = ", ".join(cli.unheeded(cfg, own))
         print(
-            f"{cfg.resume} goes on with the options that it began with, but for --iterations and --max-minutes"
+            f"{run} goes on with the options that it began with, but for {flags}"
             + (f"; not heeded: {unheeded}" if unheeded else "")
         )
     return own
 
 
-def run_folder(cfg: RunConfig) -> Path:
+def folder_of(cfg: RunConfig) -> Path:
     """Where a run writes."""
     return cfg.resume or cfg.runs / cfg.name
 
@@ -115,7 +120,7 @@ def check_began_with(run: Path | None, kind: str, digest: str, path: Path) -> No
         ArtifactError: if they are others.
     """
     if run is not None and (run / "policy" / MANIFEST_FILE).is_file():
-        began = json.loads((run / "policy" / MANIFEST_FILE).read_text(encoding="utf-8"))[kind]
+        began = json.loads((run / "policy" / MANIFEST_FILE).read_text(encoding="utf-8")).get(kind, digest)
         if began != digest:
             raise ArtifactError(
                 f"{run} began with another policy ({kind} {began[:12]}) than {path} holds now ({digest[:12]}); put it "
@@ -211,7 +216,14 @@ def run(
 
     Returns:
         The run folder.
+
+    Raises:
+        ValueError: if there is no iteration, or no checkpoint.
     """
+    if cfg.iterations < 1 or cfg.checkpoint_every < 1:
+        raise ValueError(
+            f"expected --iterations and --checkpoint-every of at least 1, got {cfg.iterations}, {cfg.checkpoint_every}"
+        )
     with distributed.processes(cuda=simulator_device(cfg.simulator, cfg.device).type == "cuda"):
         return _run(recipe, cfg, build(cfg), begin, iterate, save_policy, headline)
 
@@ -226,9 +238,9 @@ def _run(
     headline: tuple[str, ...],
 ) -> Path:
     resumed, first = cfg.resume is not None, distributed.rank() == 0
-    folder = run_folder(cfg)
+    folder = folder_of(cfg)
     if first:
-        cli.start_run(cfg, folder, resume=resumed, recipe=recipe, processes=distributed.size())
+        run_folder.start_run(cfg, folder, resume=resumed, recipe=recipe, processes=distributed.size())
     distributed.wait()
     progress: dict[str, float] = {"iteration": 0, "minutes": 0.0}
     saved = SavedRun(folder / "checkpoints", parts, progress)
@@ -246,13 +258,13 @@ def _run(
             begin(parts, cfg)
         except BaseException:  # nothing is learned yet, and the name stays free
             if first and not resumed:
-                cli.abandon_run(folder)
+                run_folder.abandon_run(folder)
             raise
         distributed.share(part for part in parts.alike.values() if isinstance(part, nn.Module))
     logger = MCAPLogger(folder.name, folder.parent, resume=resumed) if first else None
     if logger is not None and not resumed:
-        logger.log_hparams(cli.to_json(cfg))
-    start = time.monotonic() - 60.0 * progress["minutes"]
+        logger.log_hparams(run_folder.to_json(cfg))
+    start, late = time.monotonic() - 60.0 * progress["minutes"], False
 
     def save() -> None:
         if logger is not None:
@@ -273,12 +285,13 @@ def _run(
                 display.update(int(progress["iteration"]), metrics)
             if progress["iteration"] == 1 or progress["iteration"] % cfg.checkpoint_every == 0:
                 save()  # after the first one too: what comes once before a training is part of it, and may take long
-            late = cfg.max_minutes is not None and progress["minutes"] >= cfg.max_minutes
-            if distributed.anyone(late):
+            late = distributed.anyone(cfg.max_minutes is not None and progress["minutes"] >= cfg.max_minutes)
+            if late:
                 break
     save()
     if logger is not None:
         logger.close()
-        print(f"saved {folder}")
+        left = f" after {progress['iteration']:.0f} of {cfg.iterations} iterations" + ", by --max-minutes" * late
+        print(f"saved {folder}" + left * (progress["iteration"] < cfg.iterations))
     parts.env.close()
     return folder

@@ -34,7 +34,7 @@ from tsc_student_setup import make_augmentation
 from agility_rl import keys
 from agility_rl.deploy.artifact import Artifact
 from agility_rl.modules import RecurrentStudent
-from agility_rl.training import cli
+from agility_rl.training import cli, run_folder
 from agility_rl.training.precision import Precision, hidden_precision
 from agility_rl.training.seeding import seed_everything
 
@@ -154,7 +154,6 @@ def main(cfg: Config) -> Path:
     trained = load_trained(cfg.student, "student")
     device = torch.device(cfg.device)
     train, test = load_images(cfg, device)
-    folder = cli.start_run(cfg, cfg.runs / cfg.name, recipe="tsc_glances")
     seeds = seed_everything(cfg.seed, device)
     student = resized(trained, cfg).to(device)
     student.depth_encoder.to(memory_format=torch.channels_last)
@@ -162,6 +161,7 @@ def main(cfg: Config) -> Path:
     settings = GlanceConfig(batch=cfg.batch, learning_rate=cfg.learning_rate, kept=len(train))
     augmentation = make_augmentation(cfg.augmentation, seeds.generator("augmentation"))
     glances = Glances.of(student, course_of(trained.course), settings, augmentation, seeds.generator("batches"))
+    folder = run_folder.start_run(cfg, cfg.runs / cfg.name, recipe="tsc_glances")
     glances.images.extend(train)
     print(f"{len(train)} images to learn from, {len(test)} held out")
     show("before; held out", glances.measure(test))

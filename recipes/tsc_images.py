@@ -27,7 +27,7 @@ from tsc_artifacts import load_trained
 from tsc_student_config import CPU
 from tsc_student_setup import build, load_student, resolve, teachers_parts
 
-from agility_rl.training import cli
+from agility_rl.training import cli, run_folder
 
 IMAGES_FILE = "images.safetensors"
 
@@ -110,8 +110,12 @@ def main(cfg: Config) -> Path:
     """Collect and save; returns the run folder."""
     check(cfg)
     torch.set_num_threads(cfg.num_threads)
-    folder = cli.start_run(cfg, cfg.runs / cfg.name, recipe="tsc_images")
-    images = collect(cfg)
+    folder = run_folder.start_run(cfg, cfg.runs / cfg.name, recipe="tsc_images")
+    try:
+        images = collect(cfg)
+    except BaseException:  # there is nothing to go on with, and the name stays free
+        run_folder.abandon_run(folder)
+        raise
     save_file({name: value.contiguous() for name, value in images.items()}, folder / IMAGES_FILE)
     print(f"{images.numel()} images of {images.shape[1]} robots: {folder / IMAGES_FILE}")
     return folder

@@ -29,7 +29,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch.optim.swa_utils import AveragedModel
 from torchrl.data import Unbounded
 from torchrl.envs import Compose, InitTracker, TensorDictPrimer, TransformedEnv
-from training_run import Laps, check_began_with, own_options, run
+from training_run import KEPT, Laps, check_began_with, own_options, run
 from tsc_artifacts import load_bbc_of, load_trained, refuse_starts_after, trained_bbc
 from tsc_config import CPU as TEACHER
 from tsc_config import CurriculumConfig, PPOConfig, RewardConfig
@@ -263,4 +263,4 @@ def train(cfg: Config) -> Path:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        train(cli.from_presets(PRESETS, doc=__doc__))
+        train(cli.from_presets(PRESETS, doc=__doc__, kept=KEPT))

@@ -27,7 +27,7 @@ from glances import asked, known_terrain, pretrain
 from learning_rates import annealed, set_learning_rate
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from training_run import Laps, finite, own_options, run
+from training_run import KEPT, Laps, finite, own_options, run
 from tsc_artifacts import refuse_starts_after
 from tsc_student_config import PRESETS, Config
 from tsc_student_setup import (
@@ -185,4 +185,4 @@ def train(cfg: Config) -> Path:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        train(cli.from_presets(PRESETS, doc=__doc__))
+        train(cli.from_presets(PRESETS, doc=__doc__, kept=KEPT))

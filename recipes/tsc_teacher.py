@@ -23,7 +23,7 @@ from course_metrics import judge, set_course
 from held_fixed import fit, infer
 from tensordict import TensorDictBase
 from torch import Tensor
-from training_run import Laps, own_options, policy_to_start_from, run
+from training_run import KEPT, Laps, own_options, policy_to_start_from, run
 from tsc_cloning import clone
 from tsc_config import PRESETS, Config
 from tsc_ppo import add_rewards, limit_deviations, value_finished, what_happened
@@ -140,4 +140,4 @@ def train(cfg: Config) -> Path:
 
 if __name__ == "__main__":
     with cli.one_line_errors():
-        train(cli.from_presets(PRESETS, doc=__doc__))
+        train(cli.from_presets(PRESETS, doc=__doc__, kept=KEPT))

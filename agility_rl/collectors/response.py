@@ -29,11 +29,11 @@ class ResponseMemory:
     with m the mean about which the generation was drawn. In these responses the critic can judge any parameters, in the
     windows of many generations at once, and not one control step is simulated for it:
 
-    .. math:: \xi^* = \arg\max_\xi \sum_{\text{windows}} \tilde D(s, a, s'(\xi)), \qquad
-              \| C^{-1/2} (\xi^* - m) \| \le \text{trust}
+    .. math:: \xi^* = \arg\max_\xi \sum_{\text{windows}} \tilde D(s, a, s'(\xi))
 
-    where C is the covariance with which the last generation was drawn: further away nothing says that the response is
-    linear. Remembered are the later generations, a fixed share of them; the first ones are drawn too wide.
+    and the mean goes towards it, as far as :math:`\| C^{-1/2} (\xi - m) \| = \text{trust}` at most, where C is the
+    covariance with which the last generation was drawn: further away nothing says that the response is linear.
+    Remembered are the later generations, a fixed share of them; the first ones are drawn too wide.
 
     Source: ours, not the paper's, which moves the mean to that of the survivors
     (:class:`agility_rl.collectors.EvolutionStrategy`).
@@ -113,7 +113,7 @@ class ResponseMemory:
 
     @one_thread()
     def climb(self, critic: TensorDictModuleBase, search: EvolutionStrategy) -> Tensor:
-        """Where the critic likes the remembered windows best, ``[D]``, at most ``trust`` deviations from the mean.
+        """Where the critic likes the remembered windows best, or ``trust`` deviations of the way there, ``[D]``.
 
         Args:
             critic: reads what a replayed transition has, and writes its logit first.

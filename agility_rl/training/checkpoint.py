@@ -167,7 +167,9 @@ class RunCheckpoint:
         damage = find_damage(path)
         if damage:
             others = [step_of(file) for file in _files(path.parent) if file != path and not find_damage(file)]
-            hint = f"intact: step {others[-1]}, load(step={others[-1]})" if others else "no other one is intact"
+            hint = "no other one is intact"
+            if others:
+                hint = f"intact: step {others[-1]}, load(step={others[-1]}), or remove the damaged file to resume there"
             raise CheckpointError(f"checkpoint {path} is damaged: {damage}; {hint}")
         return set(Checkpoint.manifest(path)["components"])
 
@@ -199,9 +201,9 @@ def find_damage(path: str | Path) -> str | None:
         if broken is not None:
             return f"the checksum of {broken} does not agree"
         Checkpoint.manifest(path)
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, CheckpointError) as error:
-        size = path.stat().st_size
-        return f"{size} bytes that are no complete archive, probably truncated ({str(error).splitlines()[0]})"
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, ValueError, KeyError, RuntimeError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        return f"{path.stat().st_size} bytes that are no complete archive, probably truncated ({reason})"
     return None
 
 

@@ -1,4 +1,4 @@
-"""Command line of a recipe: named presets, every field a flag, one-line errors, and the run folder it writes to.
+"""Command line of a recipe: named presets, every field a flag, one-line errors, Ctrl-C.
 
 A recipe owns a frozen dataclass and a dict of named instances; nothing in the package ever sees either.
 """
@@ -7,19 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
-import importlib.metadata
-import json
 import math
-import os
-import platform
 import signal
-import subprocess
 import sys
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,19 +20,20 @@ import tyro
 from rich.console import Console
 from torchrl.checkpoint import CheckpointError
 
-import agility_rl
-from agility_rl.training.checkpoint import publish
+from agility_rl.training.run_folder import closest, read_config
 
 C = TypeVar("C")
-CONFIG_FILE = "config.json"
-CONFIG_VERSION = 1
 STOPS = (signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 """Signals that end a loop after its present iteration."""
-_PACKAGES = ("torch", "torchrl", "tensordict", "mujoco", "numpy")
 
 
 def from_presets(
-    presets: Mapping[str, C], args: Sequence[str] | None = None, *, default: str | None = None, doc: str | None = None
+    presets: Mapping[str, C],
+    args: Sequence[str] | None = None,
+    *,
+    default: str | None = None,
+    doc: str | None = None,
+    kept: Sequence[str] = (),
 ) -> C:
     """Read ``PRESET --section.field value ...`` into the preset's configuration.
 
@@ -53,10 +47,13 @@ def from_presets(
         args: command line without the program's name; ``sys.argv[1:]`` by default.
         default: preset to use when the first argument is none.
         doc: description shown by ``--help``, such as the recipe's ``__doc__``.
+        kept: fields that may change when a run is resumed (``--resume RUN``, a field ``resume``); where the command
+            line says nothing of one, it is the run's own and not the preset's.
 
     Raises:
         SystemExit: on ``--help`` (status 0) and on any error (status 2).
-        ValueError: if there is no preset, or the presets have several types.
+        ValueError: if there is no preset, the presets have several types, or the run is one of another recipe.
+        FileNotFoundError: if there is no such run.
 
     Example:
         >>> @dataclasses.dataclass(frozen=True)
@@ -81,16 +78,19 @@ def from_presets(
     else:
         _stop(f"expected a preset first, one of {names}; got {' '.join(arguments[:1]) or 'nothing'}")
     if name not in presets:
-        _stop(f"unknown preset {name!r}; {_suggest(name, list(presets))} (presets: {names})")
+        _stop(f"unknown preset {name!r}; {closest(name, list(presets))} (presets: {names})")
     options = _options(presets[name])
-    for argument in arguments:
-        if argument.startswith("--") and argument != "--help":
-            option = argument[2:].split("=")[0].replace("_", "-")
-            if option not in options:
-                _stop(f"unknown option --{option}; {_suggest(option, options, '--')} (all of them: --help)")
+    for option in _given(arguments):
+        if option not in (*options, "help"):
+            _stop(f"unknown option --{option}; {closest(option, options, '--')} (all of them: --help)")
     description = f"{doc or kind.__doc__ or ''}\n\nPresets: {names}; the defaults shown are those of {name!r}."
     program = f"{Path(sys.argv[0]).name} {name}"
-    return _finite(tyro.cli(kind, args=arguments, default=presets[name], prog=program, description=description))
+    config = _finite(tyro.cli(kind, args=arguments, default=presets[name], prog=program, description=description))
+    left_out = [name for name in kept if name.replace("_", "-") not in _given(arguments)]
+    if not left_out or config.resume is None:  # type: ignore[attr-defined]
+        return config
+    own = read_config(config.resume, kind)  # type: ignore[attr-defined]
+    return dataclasses.replace(config, **{name: getattr(own, name) for name in left_out})  # type: ignore[type-var]
 
 
 def from_arguments(kind: type[C], args: Sequence[str] | None = None, *, doc: str | None = None) -> C:
@@ -174,79 +174,6 @@ def interruptible() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def start_run(config: Any, folder: str | Path, *, resume: bool = False, **extra: Any) -> Path:
-    """Make a run's folder and write its ``config.json``: every resolved value, versions, command line and time.
-
-    A resumed run keeps its first ``config.json`` and adds ``config.resumed-N.json``.
-
-    Args:
-        config: the recipe's dataclass instance.
-        folder: ``runs/NAME``.
-        resume: continue in a folder that exists.
-        **extra: further JSON values to store, such as the recipe's name.
-
-    Raises:
-        FileExistsError: if the folder already holds a run and ``resume`` is false; nothing is ever overwritten.
-        FileNotFoundError: if ``resume`` is true and there is no run.
-    """
-    folder = Path(folder)
-    path = folder / CONFIG_FILE
-    if resume:
-        if not path.is_file():
-            raise FileNotFoundError(f"nothing to resume: {path} does not exist; expected the folder of a run")
-        count = len(list(folder.glob("config.resumed-*.json"))) + 1
-        path = folder / f"config.resumed-{count}.json"
-    elif folder.exists() and any(folder.iterdir()):
-        raise FileExistsError(
-            f"{folder} already holds a run; choose another name, or continue it with --resume {folder}"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    record = {
-        "config_version": CONFIG_VERSION,
-        "config": to_json(config),
-        "versions": versions(),
-        "command": sys.argv,
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        **extra,
-    }
-    write_json(path, record)
-    return folder
-
-
-def abandon_run(folder: str | Path) -> None:
-    """Free the name of a run that :func:`start_run` began and that could not go on; anything but its record stays."""
-    folder = Path(folder)
-    (folder / CONFIG_FILE).unlink(missing_ok=True)
-    for empty in (*folder.iterdir(), folder):
-        with contextlib.suppress(OSError):
-            empty.rmdir()
-
-
-def read_config(folder: str | Path, kind: type[C]) -> C:
-    """Configuration of a run, from its ``config.json``, as the recipe's dataclass.
-
-    Raises:
-        FileNotFoundError: if there is no ``config.json``.
-        ValueError: if the file is damaged, or has fields that the dataclass does not know.
-    """
-    path = Path(folder) / CONFIG_FILE
-    if not path.is_file():
-        raise FileNotFoundError(f"nothing to resume: {path} does not exist; expected the folder of a run")
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        values, version = record["config"], record["config_version"]
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is damaged or no run's configuration: {error}") from error
-    if version != CONFIG_VERSION:
-        raise ValueError(
-            f"{path} has configuration version {version}, expected {CONFIG_VERSION}; use the release it names"
-        )
-    try:
-        return from_json(kind, values, str(path))
-    except ValueError as error:
-        raise ValueError(f"{error}; it is the configuration of a run of {record.get('recipe')}.py") from error
-
-
 def unheeded(asked: Any, began: Any, arguments: Sequence[str] | None = None) -> list[str]:
     """Options of a command line that a run does not heed, since it began with others, each with what it began with.
 
@@ -263,8 +190,7 @@ def unheeded(asked: Any, began: Any, arguments: Sequence[str] | None = None) -> 
         >>> unheeded(Config(3, False), Config(4), ["cpu", "--epochs", "3", "--no-mirror"])
         ['--epochs (4)', '--no-mirror (True)']
     """
-    given = (argument[2:].split("=")[0] for argument in (sys.argv[1:] if arguments is None else arguments))
-    known = [option for option in dict.fromkeys(given) if option.replace("_", "-") in _options(asked)]
+    known = [option for option in _given(sys.argv[1:] if arguments is None else arguments) if option in _options(asked)]
     return [
         f"--{option} ({_value(began, option)})" for option in known if _value(asked, option) != _value(began, option)
     ]
@@ -278,73 +204,10 @@ def _value(config: Any, option: str) -> Any:
     return getattr(config, name) if hasattr(config, name) else getattr(config, name.removeprefix("no_"))
 
 
-def to_json(value: Any) -> Any:
-    """Dataclasses, paths and tuples as plain JSON values."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): to_json(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_json(item) for item in value]
-    return str(value) if isinstance(value, os.PathLike) else value
-
-
-def from_json(kind: Any, value: Any, where: str = "config") -> Any:
-    """Inverse of :func:`to_json` for a known type: nested dataclasses, tuples, paths, optional values.
-
-    Raises:
-        ValueError: if a dataclass has no field of a given name; the message names the closest one.
-
-    Example:
-        >>> @dataclasses.dataclass(frozen=True)
-        ... class Config:
-        ...     hidden: tuple[int, ...] = (64,)
-        >>> from_json(Config, {"hidden": [32, 16]})
-        Config(hidden=(32, 16))
-    """
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
-        hints = typing.get_type_hints(kind)
-        for name in value:
-            if name not in hints:
-                raise ValueError(f"{where}: unknown field {name!r} in {kind.__name__}; {_suggest(name, list(hints))}")
-        return kind(**{name: from_json(hints[name], item, f"{where}: {name}") for name, item in value.items()})
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (types.UnionType, typing.Union):
-        options = [option for option in arguments if option is not type(None)]
-        return None if value is None else from_json(options[0], value, where)
-    if origin is tuple and isinstance(value, list):
-        inner = [arguments[0]] * len(value) if len(arguments) == 2 and arguments[1] is Ellipsis else list(arguments)
-        return tuple(from_json(item_kind, item, where) for item_kind, item in zip(inner, value, strict=True))
-    return Path(value) if kind is Path else value
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file in one step that a kill or a power cut cannot split."""
-    staged = path.with_name(f".{path.name}.incoming")
-    staged.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
-    publish(staged, path)
-
-
-def versions() -> dict[str, str]:
-    """Versions of this package, of what it stands on, of Python, and of the source when it is a git checkout."""
-    found = {"agility_rl": agility_rl.__version__, "python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    source = Path(agility_rl.__file__)
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(source.parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", source.name)  # else the checkout is one that it was installed into
-        found["commit"] = git("describe", "--always", "--dirty", "--abbrev=12")
-    except (OSError, subprocess.SubprocessError):
-        pass
-    return found
+def _given(arguments: Sequence[str]) -> list[str]:
+    """Flags of a command line, each once, as :func:`_options` writes them."""
+    flags = (argument[2:].split("=")[0] for argument in arguments if argument.startswith("--"))
+    return list(dict.fromkeys(flag.replace("_", "-") for flag in flags))
 
 
 def _options(config: Any, prefix: str = "") -> list[str]:
@@ -364,18 +227,17 @@ def _options(config: Any, prefix: str = "") -> list[str]:
 def _finite(config: C) -> C:
     """The same, if its numbers are numbers: NaN compares with nothing, and passes the checks that come later."""
     for option in _options(config):
-        value = _value(config, option)
-        numbers = [number for number in (value if isinstance(value, tuple) else (value,)) if isinstance(number, float)]
-        if not all(map(math.isfinite, numbers)):
-            _stop(f"--{option} must be finite, got {' '.join(map(str, numbers))}")
+        if wrong := [number for number in _numbers(_value(config, option)) if not math.isfinite(number)]:
+            _stop(f"--{option} must be finite, got {wrong[0]}")
     return config
 
 
-def _suggest(name: str, known: list[str], dashes: str = "") -> str:
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    if not close:  # a field given without its section, or in the wrong one
-        close = [option for option in known if option.split(".")[-1] == name.split(".")[-1]][:1]
-    return f"did you mean {dashes}{close[0]}?" if close else "nothing known resembles it"
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from _numbers(part)
 
 
 def _stop(message: str) -> typing.NoReturn:

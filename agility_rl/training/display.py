@@ -69,13 +69,17 @@ class Display:
                 self._live.update(self._table(iteration, metrics))
         elif (iteration - self._first) % self.lines_every == 1 or self.lines_every == 1 or iteration == self.total:
             shown = "  ".join(f"{name} {metrics[name]:.3g}" for name in self.headline if name in metrics)
-            self.console.print(
-                f"{self.title} {iteration}/{self.total}  {shown}", highlight=False, markup=False, soft_wrap=True
-            )
+            self._print(f"{self.title} {iteration}/{self.total}  {shown}", soft_wrap=True)
 
     def note(self, message: str) -> None:
         """Print a line above the display."""
-        self.console.print(message, highlight=False, markup=False)
+        self._print(message)
+
+    def _print(self, line: str, soft_wrap: bool | None = None) -> None:
+        # Where a reader has gone (``| head``, a Ctrl-C that ended ``| tee`` too), rich asks to exit and is silent from
+        # then on; a training is not to end unsaved by that.
+        with contextlib.suppress(OSError, SystemExit):
+            self.console.print(line, highlight=False, markup=False, soft_wrap=soft_wrap)
 
     def _table(self, iteration: int, metrics: Mapping[str, float]) -> Table:
         elapsed = time.monotonic() - self._start

@@ -191,24 +191,6 @@ def normalized_mutual_information(counts: Tensor) -> float:
     return round(min(1.0, max(0.0, 2 * information / total)), 12)
 
 
-def average_entropy(counts: Tensor) -> float:
-    """How scattered the shown behaviours of one commanded behaviour are [nats]: 0 when each has one of its own.
-
-    .. math:: H(Y | X) = H(X, Y) - H(X)
-
-    Source: conditional entropy; "ENT" of Ess-InfoGAIL (Fu et al. 2023).
-
-    Args:
-        counts: ``[C, K]``, rows commanded.
-
-    Example:
-        >>> average_entropy(torch.eye(5)), round(average_entropy(torch.ones(5, 5)), 4)
-        (0.0, 1.6094)
-    """
-    joint = _joint(counts)
-    return round(max(0.0, _entropy(joint.flatten()) - _entropy(joint.sum(1))), 12)
-
-
 def _joint(counts: Tensor) -> Tensor:
     counts = counts.detach().double().cpu()
     if counts.ndim != 2 or bool((counts < 0).any()) or counts.sum() <= 0:

@@ -72,7 +72,7 @@ class PPOUpdate:
             compiler on a CPU; numbers differ by rounding.
 
     Raises:
-        ValueError: if the batch does not hold a sample for each minibatch (at the call).
+        ValueError: if there is no pass or no minibatch, or (at the call) the batch has no sample for each minibatch.
 
     Example:
         See ``recipes/bbc_pretrain.py``; ``PPOUpdate(loss, optimizer, epochs=5, minibatches=4)`` is the least.
@@ -96,6 +96,8 @@ class PPOUpdate:
         precision: torch.dtype = torch.float32,
         compile: bool = False,
     ) -> None:
+        if epochs < 1 or minibatches < 1:
+            raise ValueError(f"expected epochs and minibatches of at least 1, got {epochs} and {minibatches}")
         self.loss = loss
         self._losses: Callable[[TensorDictBase], TensorDictBase] = compiled(loss, compile)
         self.optimizer = optimizer

@@ -31,7 +31,7 @@ class Rollout:
             those alone whose episode ends, whose number differs; a policy may be given compiled.
 
     Raises:
-        ValueError: if the environment has no batch dimension.
+        ValueError: if the environment has no batch dimension, or there is no step.
     """
 
     def __init__(
@@ -46,6 +46,8 @@ class Rollout:
     ) -> None:
         if len(env.batch_size) != 1:
             raise ValueError(f"expected an environment with batch_size [N], got {list(env.batch_size)}")
+        if num_steps < 1:
+            raise ValueError(f"num_steps must be at least 1, got {num_steps}")
         self.env = env
         self.num_steps = num_steps
         self.keep = list(keep)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -40,19 +41,24 @@ def test_trainings_end_in_a_table_go_on_where_they_stopped_and_are_not_done_twic
     assert "loss_skill" not in read_scalars(nameless) and "loss_marginal" in read_scalars(nameless)
     again = recipe("ablations", *arguments)
     assert again.returncode == 0 and "bbc_pretrain" not in again.stdout
+    for others, named in ((("--iterations", 1), "iterations"), (("--episodes", 2), "episodes")):
+        refused = recipe("ablations", *arguments, *others)
+        assert refused.returncode == 2
+        assert f"{run} was made with other {named}; choose another --runs" in " ".join(refused.stderr.split())
 
 
 def test_every_variant_is_a_command_that_the_recipe_takes(
     ablations: ModuleType, module, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    presets = module("bbc_presets")
-    for name, options in ablations.VARIANTS.items():
-        monkeypatch.setattr("sys.argv", ["bbc_pretrain.py", "cpu", *options])
-        cfg = cli.from_presets(presets.PRESETS, doc="")
-        assert (cfg == presets.CPU) == (name == "none")
+    presets = module("bbc_presets").PRESETS
+    for preset, name in itertools.product(("cpu", "half_hour", "paper"), ablations.VARIANTS):
+        monkeypatch.setattr("sys.argv", ["bbc_pretrain.py", preset, *ablations.options_of(name, preset)])
+        cfg = cli.from_presets(presets, doc="")
+        assert (cfg == presets[preset]) == (name == "none") or preset == "paper"
         if name == "task_only":
             assert cfg.imitation.imitation_reward == cfg.imitation.skill_reward == cfg.env.rhythm_weight == 0.0
-            assert cfg.changes and not any(key.startswith("imitation.") for _, key, _ in cfg.changes)
+            kept = [change for change in presets[preset].changes if not change[1].startswith("imitation.")]
+            assert list(cfg.changes) == kept and bool(kept) == (preset != "paper")
 
 
 def test_several_seeds_have_an_interval(ablations: ModuleType) -> None:

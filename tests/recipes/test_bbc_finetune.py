@@ -51,6 +51,8 @@ def test_it_trains_in_the_simulator_and_compares(
         (("--init-from", "{run}", "--simulator", "nowhere"), "nowhere"),
         (("--init-from", "{run}", "--simulator", "{run}", "--target", "nowhere.json"), "nowhere.json"),
         (("--init-from", "{run}", "--simulator", "{run}", "--training", "gpu"), "--training must be one of smoke"),
+        (("--init-from", "{run}", "--simulator", "{run}", "--seconds", "1"), "expected --seconds at least 1 s longer"),
+        (("--init-from", "{run}", "--simulator", "{run}", "--iterations", "0"), "--iterations: expected at least 1"),
     ],
 )
 def test_bad_options_give_one_clear_line(

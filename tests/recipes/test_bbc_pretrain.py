@@ -103,6 +103,28 @@ def test_init_from_starts_with_the_given_policy(finished: Path) -> None:
     assert not (finished / "other").exists()
 
 
+def test_a_run_goes_on_as_far_as_it_was_to_go_and_says_where_it_ended(finished: Path) -> None:
+    options = ("--name", "short", "--iterations", "3", "--max-minutes", "1e-6")
+    said = run(finished, *options).stdout
+    assert f"saved {finished / 'short'} after 1 of 3 iterations, by --max-minutes" in said
+    said = run(finished, "--resume", str(finished / "short"), "--max-minutes", "None").stdout
+    assert said.endswith(f"saved {finished / 'short'}\n"), "and nothing left"
+    assert RunCheckpoint(finished / "short" / "checkpoints", counters={}).steps()[-1] == 3
+
+
+def test_a_run_holds_on_to_the_policy_that_it_began_with(finished: Path) -> None:
+    shutil.copytree(finished / "whole" / "policy", finished / "start" / "policy")
+    start = ("--init-from", str(finished / "start"), "--imitation.anchor", "1")
+    run(finished, "--name", "anchored", "--iterations", "1", *start)
+    began = Artifact.load(finished / "start").manifest["weights"]["sha256"]
+    assert Artifact.load(finished / "anchored").manifest["anchored_to"] == began
+    run(finished, "--resume", str(finished / "anchored"), "--iterations", "2")
+    trained_on = {name: value + 1.0 for name, value in Artifact.load(finished / "start").state.items()}
+    Artifact.save(finished / "start" / "policy", trained_on, Artifact.load(finished / "start").manifest)
+    refused = run(finished, "--resume", str(finished / "anchored"), "--iterations", "3", check=False)
+    assert refused.returncode == 2 and f"began with another policy (anchored_to {began[:12]})" in refused.stderr
+
+
 def test_a_policy_says_what_its_start_has_learned_from_too(finished: Path) -> None:
     whole = Artifact.load(finished / "whole")
     Artifact.save(finished / "of_dogs" / "policy", whole.state, {**whole.manifest, "data": ["dogs/labelled"]})
@@ -190,6 +212,9 @@ def test_a_killed_run_goes_on(tmp_path: Path, moment: str) -> None:
         (("--iterations", "0"), "--iterations: expected at least 1, got 0"),
         (("--motion.label-share", "0"), "expected --imitation.conditional, --imitation.labelled-share"),
         (("--resume", "nowhere"), "nothing to resume"),
+        (("--checkpoint-every", "0"), "expected --iterations and --checkpoint-every of at least 1, got 2, 0"),
+        (("--ppo.minibatches", "0"), "expected epochs and minibatches of at least 1, got 1 and 0"),
+        (("--ppo.steps", "0"), "num_steps must be at least 1, got 0"),
     ],
 )
 def test_bad_options_give_one_clear_line(

@@ -29,6 +29,17 @@ def test_only_rewards_with_a_weight_are_paid(module: Module) -> None:
     assert ours["jump_height"].weight == 5.0
 
 
+def test_shares_and_delay_hold_from_the_first_episode_on(module: Module) -> None:
+    world, smoke = module("bbc_world"), module("bbc_presets").SMOKE
+    options = replace(smoke.env, num_robots=16, num_threads=1, rhythm_weight=0.0, action_delay=0.01)
+    for begins, delay in ((0, 0.01), (5, 0.0)):
+        cfg = replace(smoke, env=replace(options, shares=(0.0, 0.0, 0.0, 0.0, 1.0), action_delay_from=begins))
+        env = world.make_env(cfg, world.load_dataset(cfg.motion, 0), Seeds(0))
+        assert (env.reset()["skill"] == BEHAVIOURS.index("jump")).all()
+        torch.testing.assert_close(env.simulator.parameter("action_delay"), torch.full((16, 1), delay))
+        env.close()
+
+
 def test_rough_ground_is_as_rough_and_steep_as_told(module: Module) -> None:
     world, published = module("bbc_world"), module("bbc_config").EnvConfig()
     assert world.make_terrain(published, torch.Generator()) is None

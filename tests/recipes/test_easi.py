@@ -137,6 +137,29 @@ def test_a_search_that_was_killed_before_its_first_checkpoint_begins_anew(
     assert (whole / "result.json").read_text() == (cut / "result.json").read_text()
 
 
+def test_a_search_goes_on_as_far_as_it_was_to_go_and_names_what_it_does_not_heed(
+    easi: ModuleType, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = easi.train(smoke(easi, log, tmp_path, generations=2, max_minutes=1e-6))
+    arguments = ["smoke", "--resume", str(folder), "--max-minutes", "None", "--search.span", "2"]
+    monkeypatch.setattr("sys.argv", ["easi.py", *arguments])
+    easi.train(easi.cli.from_presets(easi.PRESETS, kept=easi.easi_config.KEPT))
+    assert json.loads((folder / "result.json").read_text())["generations"] == 2, "the preset says 3"
+    assert "but for --generations, --max-minutes, --num-threads; not heeded: --search.span (3.0)" in (
+        capsys.readouterr().out
+    )
+
+
+def test_a_friction_that_is_searched_in_part_is_the_log_s_elsewhere(
+    easi: ModuleType, log: Path, tmp_path: Path
+) -> None:
+    cfg = smoke(easi, log, tmp_path, friction_loss=0.05)
+    parts = easi.build(replace(cfg, search=replace(cfg.search, parameters=("hip_friction_loss",))))
+    fields = parts.space.fields(torch.tensor([[0.4]], dtype=torch.float64))
+    assert fields["friction_loss"][0].tolist() == pytest.approx([0.4, 0.05, 0.05] * 4)
+    parts.simulator.close()
+
+
 def test_another_log_is_no_resume(easi: ModuleType, log: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy.csv"
     copy.write_bytes(log.read_bytes())
@@ -205,6 +228,8 @@ def test_a_noisy_log_takes_longer_windows_and_a_wide_search(easi: ModuleType, lo
         (("--log", "{log}", "--critic.difference"), "relative to one state"),
         (("--log", "{log}", "--num-robots", "2"), "survivors"),
         (("--resume", "nowhere"), "nothing to resume"),
+        (("--log", "{log}", "--checkpoint-every", "0"), "expected --checkpoint-every of at least 1, got 0"),
+        (("--log", "{log}", "--critic.batch-per-robot", "0"), "expected --critic.batch-per-robot of at least 1, got 0"),
     ],
 )
 def test_bad_options_and_logs_give_one_clear_line(

@@ -15,6 +15,7 @@ from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.go2 import features
 from agility_rl.modules import BasicBehaviourController
+from agility_rl.motion.clip import save
 from agility_rl.motion.gaits import synthesize_gait
 from agility_rl.training.metrics import Interval
 
@@ -95,6 +96,20 @@ def test_impossible_options_are_refused(untrained: Path, evaluate: ModuleType, o
 def test_motion_needs_labels(evaluate: ModuleType) -> None:
     with pytest.raises(ValueError, match=r"needs --motion\.labelled"):
         evaluate.load_motion(evaluate.MotionConfig(unlabelled=Path("anywhere")), {}, 0)
+
+
+def test_motion_that_is_asked_for_must_be_there_and_motion_that_is_gone_is_named(
+    evaluate: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clips = tmp_path / "clips"
+    for name in ("walk", "trot"):
+        save(synthesize_gait(name, duration=1.0), clips / f"{name}.npz")
+    with pytest.raises(ValueError, match="clisp: expected a motion file or a folder of them, found nothing"):
+        evaluate.load_motion(evaluate.MotionConfig(clips, tmp_path / "clisp"), {}, 0)
+    trained = {"motion": {"labelled": str(clips), "unlabelled": str(tmp_path / "moved")}}
+    found = evaluate.load_motion(evaluate.MotionConfig(), trained, 0)
+    assert len(found.labelled) == 2 and found.unlabelled == []
+    assert "moved, the unlabelled motion of the training, is gone" in capsys.readouterr().out
 
 
 def test_gaits_of_robots_are_named_and_a_fall_is_no_gait(evaluate: ModuleType) -> None:

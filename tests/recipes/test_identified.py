@@ -42,12 +42,28 @@ def test_a_result_is_drawn_from_its_gaussian(module: Module, result: Path, gener
     fields = simulator.draw(20000, generator)
     stiffness, damping = fields["stiffness"], fields["damping"]
     assert (stiffness[:, [1, 2, 4]] == 40.0).all() and (damping[:, [0, 1, 3]] == 1.0).all()  # not searched: nominal
+    assert "friction_loss" not in fields, "the model has it"
     assert torch.equal(stiffness[:, 0], stiffness[:, 9]) and torch.equal(damping[:, 2], damping[:, 11])
     # u = log(x / 10) / log 16 has mean 0.5 and deviation 0.1
     u = (stiffness[:, 0] / 10.0).log() / torch.tensor(16.0).log()
     assert u.mean().item() == pytest.approx(0.5, abs=0.003) and u.std().item() == pytest.approx(0.1, rel=0.03)
     v = damping[:, 2] / 4.0
     assert torch.corrcoef(torch.stack((u, v)))[0, 1].item() == pytest.approx(0.9, abs=0.01)
+
+
+def test_joints_that_were_not_searched_keep_the_friction_of_the_log(
+    module: Module, result: Path, generator: torch.Generator
+) -> None:
+    content = json.loads(result.read_text())
+    content["parameters"] = {"hip_friction_loss": {"mean": 0.3, "unit": "N m"}}
+    content["search"] = {
+        "mean": [0.5],
+        "covariance": [[0.0]],
+        "ranges": {"hip_friction_loss": {"low": 0.1, "high": 0.5, "scale": "linear"}},
+    }
+    result.write_text(json.dumps(content))
+    friction = module("identified").load_simulator(result).draw(3, generator)["friction_loss"]
+    torch.testing.assert_close(friction[0], torch.tensor([0.3, 0.1, 0.1] * 4))
 
 
 def test_the_robot_is_told_its_own_gains(module: Module, result: Path, generator: torch.Generator) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from agility_rl.record import MCAPLogger
 from agility_rl.record.plots import new_figure, save_figure
-from agility_rl.training.cli import start_run
+from agility_rl.training.run_folder import start_run
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,14 @@ def test_pictures_of_performances_are_on_the_page(tmp_path: Path, module) -> Non
     module("report").main(module("report").Config(run))
     text = (run / "report.html").read_text()
     assert "<h2>Pictures</h2>" in text and "perform 0" in text and text.count("data:image/png;base64,") == 1
+
+
+def test_an_evaluation_of_earlier_weights_is_said_to_be_one(module) -> None:
+    outdated = module("report").outdated
+    (note,) = outdated("b" * 64, {"evaluate": {"weights": "b" * 64}, "evaluate_course": {"weights": "a" * 64}})
+    assert "an earlier policy of this run was evaluated: run recipes/evaluate_course.py on it again" in note
+    assert outdated("b" * 64, {"evaluate": None, "evaluate_course": {}}) == []
+    assert outdated(None, {"evaluate": {"weights": "a" * 64}}) == []
 
 
 def test_a_folder_that_is_no_run(tmp_path: Path, module) -> None:

@@ -165,6 +165,10 @@ def test_options_that_cannot_be(module: Module, images: Path) -> None:
             recipe.main(recipe.Config(**options_of(images.parent, **others)))
     with pytest.raises(FileNotFoundError, match=r"student/images.safetensors: no such file; expected a folder that"):
         recipe.main(recipe.Config(**options_of(images.parent, images=(images.parent / "student",))))
+    nowhere = {"student": images.parent / "nowhere", "runs": images.parent, "name": "free"}
+    with pytest.raises(FileNotFoundError, match="check the path"):
+        collect.main(collect.Config(**nowhere))
+    assert not (images.parent / "free").exists(), "the name stays free"
     for others, message in (({"led": 1.5}, "--led: expected a share"), ({"minutes": 0.0}, "--minutes above 0")):
         with pytest.raises(ValueError, match=message):
             collect.main(collect.Config(**others))

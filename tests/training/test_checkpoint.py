@@ -162,6 +162,18 @@ def test_a_truncated_file_is_refused_in_one_line_and_changes_nothing(tmp_path: P
     assert checkpoint.load(1) == 1 and model.weight.any()
 
 
+@pytest.mark.parametrize("place", [6, 10])  # version needed, and method of compression, of the first listed member
+def test_a_header_that_nobody_wrote_is_damage_too(tmp_path: Path, place: int) -> None:
+    checkpoint = RunCheckpoint(tmp_path, counters={"n": 1})
+    checkpoint.save(1)
+    path = checkpoint.save(2)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\1\2") + place] = 99
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"is damaged: .*intact: step 1, .*or remove the damaged file to resume"):
+        checkpoint.load()
+
+
 def test_a_flipped_bit_is_found(tmp_path: Path) -> None:
     path = RunCheckpoint(tmp_path, model=nn.Linear(64, 64)).save(1)
     content = bytearray(path.read_bytes())

@@ -1,22 +1,18 @@
-"""The command line: presets, flags, one-line errors, and the run folder."""
+"""The command line: presets, flags, one-line errors, signals."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
-import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
-import agility_rl
 from agility_rl.training import cli
-from agility_rl.training.cli import abandon_run, from_json, from_presets, read_config, start_run, to_json, versions
+from agility_rl.training.cli import from_presets
+from agility_rl.training.run_folder import start_run
 
 
 @dataclass(frozen=True)
@@ -32,6 +28,7 @@ class Run:
     name: str | None = None
     init_from: Path | None = None
     hidden: tuple[int, ...] = (512, 256)
+    changes: tuple[tuple[int, str, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -39,6 +36,7 @@ class Config:
     ppo: PPO = field(default_factory=PPO)
     run: Run = field(default_factory=Run)
     seed: int = 0
+    resume: Path | None = None
 
 
 PRESETS = {"paper": Config(), "cpu": Config(ppo=PPO(epochs=3), seed=1)}
@@ -80,6 +78,7 @@ def test_a_default_preset() -> None:
         (["--seed", "1"], "expected a preset first, one of paper, cpu; got --seed"),
         (["cpu", "--ppo.clip-epsilon", "nan"], "--ppo.clip-epsilon must be finite, got nan"),
         (["cpu", "--ppo.clip-epsilon=inf"], "--ppo.clip-epsilon must be finite, got inf"),
+        (["cpu", "--run.changes", "2", "lr", "nan"], "--run.changes must be finite, got nan"),
     ],
 )
 def test_mistakes_end_in_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -109,70 +108,6 @@ def test_help_shows_documentation_and_presets(arguments: list[str], capsys: pyte
 def test_presets_must_agree() -> None:
     with pytest.raises(ValueError, match=r"\['PPO', 'Run'\]"):
         from_presets({"a": PPO(), "b": Run()}, ["a"])
-
-
-def test_the_commit_is_that_of_the_package_and_of_no_checkout_around_it(tmp_path: Path) -> None:
-    package = tmp_path / "site-packages" / "agility_rl"
-    shutil.copytree(Path(agility_rl.__file__).parent, package)
-    script = "from agility_rl.training.cli import versions; print('commit' in versions())"
-
-    def told() -> str:
-        environment = os.environ | {"PYTHONPATH": str(package.parent)}
-        command = [sys.executable, "-c", script]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=True)
-        return done.stdout.strip()
-
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b.c"]
-    for arguments in (("init", "-q"), ("commit", "-q", "--allow-empty", "-m", "mine")):
-        subprocess.run([*git, *arguments], check=True)
-    assert told() == "False"
-    for arguments in (("add", "."), ("commit", "-q", "-m", "a fork")):
-        subprocess.run([*git, *arguments], check=True)
-    assert told() == "True"
-
-
-def test_a_run_folder_is_never_overwritten(tmp_path: Path) -> None:
-    config = dataclasses.replace(PRESETS["cpu"], run=Run("x", Path("runs/bbc"), (3,)))
-    folder = start_run(config, tmp_path / "runs" / "demo", recipe="bbc_pretrain")
-    record = json.loads((folder / "config.json").read_text())
-    assert record["config"]["run"] == {"name": "x", "init_from": "runs/bbc", "hidden": [3]}
-    assert record["recipe"] == "bbc_pretrain" and record["versions"]["torch"] == versions()["torch"]
-    assert read_config(folder, Config) == config
-    with pytest.raises(FileExistsError, match="already holds a run; choose another name, or continue it with --resume"):
-        start_run(config, folder)
-    for number in (1, 2):
-        start_run(config, folder, resume=True)
-        assert (folder / f"config.resumed-{number}.json").is_file()
-    with pytest.raises(FileNotFoundError, match="nothing to resume"):
-        start_run(config, tmp_path / "none", resume=True)
-
-
-def test_a_run_that_cannot_begin_leaves_its_name_free(tmp_path: Path) -> None:
-    run = tmp_path / "runs" / "mine"
-    start_run(PRESETS["cpu"], run)
-    (run / "checkpoints").mkdir()
-    abandon_run(run)
-    assert not run.exists() and run.parent.exists()
-    start_run(PRESETS["cpu"], run)
-    (run / "notes.txt").write_text("mine")
-    abandon_run(run)
-    assert [path.name for path in run.iterdir()] == ["notes.txt"]
-
-
-def test_json_round_trip_and_unknown_fields() -> None:
-    config = Config(run=Run(init_from=Path("a/b")))
-    assert from_json(Config, json.loads(json.dumps(to_json(config)))) == config
-    with pytest.raises(ValueError, match=r"config: ppo: unknown field 'epoch' in PPO; did you mean epochs\?"):
-        from_json(Config, {"ppo": {"epoch": 3}})
-
-
-def test_a_damaged_configuration_is_named(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text('{"config": {')
-    with pytest.raises(ValueError, match="is damaged"):
-        read_config(tmp_path, Config)
-    (tmp_path / "config.json").write_text('{"config": {}, "config_version": 99}')
-    with pytest.raises(ValueError, match="configuration version 99, expected 1"):
-        read_config(tmp_path, Config)
 
 
 def test_every_signal_to_end_lets_the_present_iteration_finish() -> None:
@@ -206,8 +141,20 @@ def test_options_that_a_resumed_run_does_not_heed_are_named() -> None:
     began = Config(ppo=PPO(epochs=7), seed=4)
     given = ["cpu", "--ppo.clip_epsilon=0.1", "--ppo.fused", "--seed", "4", "--run.hidden", "8", "4"]
     assert cli.unheeded(from_presets(PRESETS, given), began, given) == [
-        "--ppo.clip_epsilon (0.2)",
+        "--ppo.clip-epsilon (0.2)",
         "--ppo.fused (False)",
         "--run.hidden ((512, 256))",
     ]
     assert cli.unheeded(PRESETS["cpu"], began, ["cpu"]) == []
+    config = dataclasses.replace(began, run=Run(name="x"))
+    assert cli.unheeded(config, began, ["cpu", "--resume", "./run.name"]) == [], "a value is no option"
+
+
+def test_a_resumed_run_keeps_what_the_command_line_leaves_out(tmp_path: Path) -> None:
+    start_run(Config(ppo=PPO(epochs=7), seed=4), tmp_path / "mine")
+    resume = ["cpu", "--resume", str(tmp_path / "mine")]
+    assert from_presets(PRESETS, resume, kept=("seed",)).seed == 4, "the preset says 1"
+    assert from_presets(PRESETS, [*resume, "--seed", "1"], kept=("seed",)).seed == 1
+    assert from_presets(PRESETS, ["cpu"], kept=("seed",)).seed == 1
+    with pytest.raises(FileNotFoundError, match="nothing to resume"):
+        from_presets(PRESETS, ["cpu", "--resume", "nowhere"], kept=("seed",))

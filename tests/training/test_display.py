@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from io import StringIO
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -51,6 +54,28 @@ def test_notes_are_printed_as_they_are() -> None:
     with Display("bbc", 1, console=console) as display:
         display.note("saved in runs/[bold]/x [of 3]")
     assert text(console) == "saved in runs/[bold]/x [of 3]\n"
+
+
+def test_a_reader_that_is_gone_ends_no_training(tmp_path: Path) -> None:
+    script = """
+import sys
+from agility_rl.training.display import Display
+with Display("bbc", 3, lines_every=1) as display:
+    for iteration in (1, 2, 3):
+        display.update(iteration, {})
+        sys.stdout.flush()
+        sys.stdin.readline()  # the reader closes its end here
+    display.note("done")
+open(sys.argv[1], "w").write("saved")
+"""
+    command = [sys.executable, "-c", script, str(tmp_path / "end")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stdout is not None
+        assert process.stdout.readline() == b"bbc 1/3  \n"
+        process.stdout.close()
+        process.stdin.close()
+        assert process.wait(60) == 0
+    assert (tmp_path / "end").read_text() == "saved"
 
 
 def test_a_terminal_shows_groups() -> None:
