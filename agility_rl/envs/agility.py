@@ -152,6 +152,8 @@ class AgilityEnv(MaskedResets):
         self.dt = self.simulator.control_dt
         self.decision_steps = decision_steps
         self.rewards, self.terminations = dict(rewards), dict(terminations)
+        if not self.rewards or not self.terminations:
+            raise ValueError("expected at least one reward term and one termination, got none")
         self.termination_reward = termination_reward
         self.randomization = randomization
         self.max_steps = round(episode_length / self.dt)

@@ -56,7 +56,7 @@ _BUFFERS = ("kind", "position", "yaw", "lift", "jumped")
 
 
 class Encounters:
-    """A bar, a ramp or a box ahead of each of ``N`` robots, anew whenever it lies behind or another command comes.
+    """A bar, a ramp or a box ahead of each of ``N`` robots, anew whenever it lies behind or another command is drawn.
 
     A box lies where a jump begins, not before a robot that is jumping anyway: where its feet are then is settled, which
     whoever tells it to jump can make use of, and the robot need not see it. It is told to go straight on, fast and

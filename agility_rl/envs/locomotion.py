@@ -22,7 +22,7 @@ from agility_rl.envs.rhythm import Rhythm
 from agility_rl.envs.robots import CLEARANCE, Pushes, Robots
 from agility_rl.envs.state import LocomotionState
 from agility_rl.envs.terminations import LOCOMOTION_TERMINATIONS, Termination
-from agility_rl.go2 import constants, features
+from agility_rl.go2 import constants, features, kinematics
 from agility_rl.simulation import Simulator, make_simulator
 from agility_rl.tensors import constant, rows_of
 
@@ -117,6 +117,8 @@ class LocomotionEnv(MaskedResets):
         self.dt = self.simulator.control_dt
         self.rewards = dict(rewards)
         self.terminations = tuple(terminations)
+        if not self.rewards or not self.terminations:
+            raise ValueError("expected at least one reward term and one termination, got none")
         self.randomization = randomization
         self.max_steps = round(episode_length / self.dt)
         self.generator = torch.Generator(device).manual_seed(seed)
@@ -177,7 +179,7 @@ class LocomotionEnv(MaskedResets):
         return self.batch_size[0]
 
     def set_commands(self, skill: Tensor, command: Tensor, shift: Tensor | None = None) -> None:
-        """Command every robot from the next observation on.
+        """Command every robot from the next observation on; what lies in its way stays (:class:`Encounters`).
 
         Args:
             skill: int64 ``[N]``.
@@ -188,7 +190,13 @@ class LocomotionEnv(MaskedResets):
         self.commands.assign(self._everyone(), *(given.to(self.device) for given in (skill, command, shift)))
 
     def set_skill_probabilities(self, probabilities: Tensor) -> None:
-        """Draw future skills from ``[5]`` probabilities (the skill prior)."""
+        """Draw future skills from ``[5]`` probabilities (the skill prior).
+
+        Raises:
+            ValueError: if they are not one for each behaviour.
+        """
+        if tuple(probabilities.shape) != (behaviours.NUM_BEHAVIOURS,):
+            raise ValueError(f"expected [{behaviours.NUM_BEHAVIOURS}] probabilities, got {list(probabilities.shape)}")
         self.commands.probabilities = probabilities.detach().to(self.device, copy=True)
 
     def _everyone(self) -> Tensor:
@@ -273,16 +281,26 @@ class LocomotionEnv(MaskedResets):
         turn = rotations.from_euler(torch.zeros_like(yaw), torch.zeros_like(yaw), yaw)
         place = self.simulator.ground_extent * uniform((n, 2), (-1.0, 1.0), self.generator)
         height = self.simulator.ground_height(place)[:, None] + start["root_height"] + CLEARANCE
+        position = torch.cat((place, height), -1)
+        quaternion = rotations.multiply(turn, start["root_quaternion"])
+        if self.simulator.ground_extent > 0.0:  # a plane is as high under the feet as under the trunk
+            position[:, 2] += self._buried(position, quaternion, start["joint_position"])
         self.simulator.reset(
             mask,
-            root_position=torch.cat((place, height), -1),
-            root_quaternion=rotations.multiply(turn, start["root_quaternion"]),
+            root_position=position,
+            root_quaternion=quaternion,
             root_linear_velocity=rotations.rotate(turn, start["root_linear_velocity"]),
             root_angular_velocity=rotations.rotate_inverse(start["root_quaternion"], start["root_angular_velocity"]),
             joint_position=start["joint_position"],
             joint_velocity=start["joint_velocity"],
         )
         return None if past is None else past[number[rows_of(mask)]]
+
+    def _buried(self, position: Tensor, quaternion: Tensor, joint_position: Tensor) -> Tensor:
+        """By how much ``[N]`` [m] the deepest sole is nearer to the ground below it than ``CLEARANCE``."""
+        feet = position[:, None] + rotations.rotate(quaternion[:, None], kinematics.forward(joint_position))
+        ground = self.simulator.ground_height(feet[..., :2].flatten(0, 1)).view(feet.shape[:2])
+        return (ground + CLEARANCE - (feet[..., 2] - constants.FOOT_RADIUS)).clamp(min=0.0).amax(-1)
 
     def _ground(self, position: Tensor) -> Tensor:
         """Height [m] of what robots stand on under horizontal positions ``[N, 2]``, as ``[N]``."""

@@ -17,7 +17,11 @@ from agility_rl.go2 import constants
 
 @dataclass(frozen=True)
 class Randomization:
-    """Closed intervals from which parameters are drawn uniformly; an interval of one value switches a draw off."""
+    """Closed intervals from which parameters are drawn uniformly; an interval of one value switches a draw off.
+
+    What is drawn replaces what the simulator was made with: its ground's friction, and gains and trunk other than the
+    robot's own.
+    """
 
     friction: tuple[float, float] = (0.6, 2.0)
     trunk_mass: tuple[float, float] = (0.0, 1.5)
@@ -25,7 +29,7 @@ class Randomization:
     trunk_com: tuple[float, float] = (-0.1, 0.1)
     """Offset of the centre of mass on each axis [m]."""
     gain: tuple[float, float] = (0.8, 1.2)
-    """Multipliers of stiffness and damping, per joint."""
+    """Multipliers of the robot's own stiffness and damping (:mod:`agility_rl.go2.constants`), per joint."""
     action_delay: tuple[float, float] = (0.0, 0.0)
     """Seconds between a target and its arrival at the motors."""
     draw: Callable[[int, torch.Generator], dict[str, Tensor]] | None = None

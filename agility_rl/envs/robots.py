@@ -68,6 +68,7 @@ class Robots:
         sample_parameters(n, NOMINAL, generator)  # what is drawn afterwards is then what results were drawn with
         present = {name: simulator.parameter(name) for name in DESCRIBED}
         self.privileged, self.stiffness, self.damping = described(present), present["stiffness"], present["damping"]
+        self._delayed = False
 
     def step(self, action: Tensor) -> None:
         """Hold joint targets ``q_default + scale * action`` for one control step."""
@@ -95,6 +96,9 @@ class Robots:
     def randomize(self, mask: Tensor, ranges: Randomization) -> None:
         """Draw physical parameters of the rows of a bool mask anew."""
         fields, privileged = sample_parameters(len(mask), ranges, self.generator)
+        if self._delayed and "action_delay" not in fields:
+            fields["action_delay"] = torch.zeros_like(fields["ground_friction"])
+        self._delayed |= "action_delay" in fields
         self.simulator.set_parameters(mask, **fields)
         row = mask[:, None]
         self.privileged = torch.where(row, privileged, self.privileged)
@@ -115,7 +119,6 @@ class Robots:
         """The present, as the terms of an environment see it."""
         simulator = self.simulator
         roll, pitch, yaw = rotations.to_euler(simulator.root_quaternion)
-        target = self._default_pose + self._action_scale * action
         force = simulator.contact_force
         legs = force[:, 1:].unflatten(-1, (4, 4))
         return LocomotionState(
@@ -130,7 +133,8 @@ class Robots:
             joint_position=simulator.joint_position,
             joint_velocity=simulator.joint_velocity,
             previous_joint_velocity=self.joint_velocity,
-            torque=self.stiffness * (target - simulator.joint_position) - self.damping * simulator.joint_velocity,
+            torque=self.stiffness * (simulator.motor_target - simulator.joint_position)
+            - self.damping * simulator.joint_velocity,
             previous_torque=self.torque,
             action=action,
             previous_action=self.action,
@@ -153,7 +157,8 @@ class Robots:
         return {name: getattr(self, name).clone() for name in _BUFFERS}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned; further entries are left alone."""
+        """Restore what :meth:`state_dict` returned, after the simulator; further entries are left alone."""
+        self._delayed = bool(self.simulator.parameter("action_delay").any())
         for name in _BUFFERS:
             setattr(self, name, state[name].clone())
 
@@ -169,11 +174,16 @@ class Pushes:
         interval: control steps between two pushes of a robot; ``None`` for no pushes.
         velocity: largest speed on each axis that a push sets [m/s].
 
+    Raises:
+        ValueError: if the interval is no control step.
+
     Attributes:
         phase: int64 ``[N]``, control steps by which a robot's pushes are early.
     """
 
     def __init__(self, num_robots: int, generator: torch.Generator, interval: int | None, velocity: float) -> None:
+        if interval is not None and interval < 1:
+            raise ValueError("push_interval must be at least a control step, or None for no pushes")
         self.generator, self.interval, self.velocity = generator, interval, velocity
         self.phase = torch.zeros(num_robots, dtype=torch.int64, device=generator.device)
 

@@ -26,7 +26,7 @@ class LocomotionState:
         joint_position: ``[N, 12]`` [rad].
         joint_velocity: ``[N, 12]`` [rad/s].
         previous_joint_velocity: ``[N, 12]`` one control step earlier.
-        torque: ``[N, 12]`` PD torque before the limits [N m].
+        torque: ``[N, 12]`` PD torque before the limits [N m], towards the targets that the motors have.
         previous_torque: ``[N, 12]``.
         action: ``[N, 12]``.
         previous_action: ``[N, 12]``.

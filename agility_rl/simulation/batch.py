@@ -31,6 +31,8 @@ _WARNINGS = [
         mujoco.mjtWarning.mjWARN_BADCTRL,
     )
 ]
+_VIEWS = ("_qpos", "_qvel", "_ctrl", "_sensordata", "_mocap_position", "_mocap_quaternion")
+"""Attributes that look into the memory of the batch."""
 
 
 class BatchSimulator:
@@ -88,7 +90,7 @@ class BatchSimulator:
             self.world, num_simulations, lambda field: torch.from_numpy(self.batch.expand(field))
         )
         self._previous_target = torch.tensor(constants.DEFAULT_POSE).repeat(num_simulations, 1)
-        self._warned = self._warning_count()
+        self._cameras: list[DepthCamera] = []
         self.unstable = torch.zeros(num_simulations, dtype=torch.bool)
         self._qpos[:, JOINTS] = self._ctrl[:] = constants.DEFAULT_POSE
         self.batch.forward()
@@ -101,6 +103,7 @@ class BatchSimulator:
             ValueError: if ``target`` has another shape.
         """
         check_target(target, self.num_simulations)
+        self.batch.warning[:, _WARNINGS, 1] = 0  # it forgets its counts where it begins anew: none can be compared
         failed: list[int] = []
         if self._parameters.delay is None:
             self._ctrl[:] = target.numpy()
@@ -108,9 +111,7 @@ class BatchSimulator:
         else:
             failed += self._step_delayed(target)
         self._previous_target = target.clone()
-        count = self._warning_count()
-        self.unstable = torch.from_numpy(count != self._warned)
-        self._warned = count
+        self.unstable = torch.from_numpy(self.batch.warning[:, _WARNINGS, 1].any(-1))
         self._read()
         self.unstable[failed] = True
 
@@ -172,7 +173,6 @@ class BatchSimulator:
         self._previous_target = torch.where(mask[:, None], joint_position, self._previous_target)
         rest()
         self.batch.forward(ids)
-        self._warned[ids] = self._warning_count()[ids]
         self.unstable = self.unstable & ~mask
         self._read()
 
@@ -201,11 +201,9 @@ class BatchSimulator:
         self.root_linear_velocity, self.root_angular_velocity = qvel[:, :3], qvel[:, 3:6]
         self.joint_velocity = qvel[:, JOINT_SPEEDS]
         self.hinge_angle = qpos[:, self._hinges]
+        self.motor_target = torch.from_numpy(self._ctrl.astype(np.float32))
         forces = torch.from_numpy(self._sensordata[:, FORCES].astype(np.float32))
         self.contact_force = torch.linalg.vector_norm(forces.unflatten(-1, (-1, 3)), dim=-1)
-
-    def _warning_count(self) -> np.ndarray:
-        return self.batch.warning[:, _WARNINGS, 1].sum(-1)
 
     def set_parameters(self, mask: Tensor, **fields: Tensor) -> None:
         """Change parameters of :data:`PARAMETERS` in the rows of a bool mask; each value is ``[N, size]``.
@@ -240,7 +238,8 @@ class BatchSimulator:
 
     def make_camera(self) -> DepthCamera:
         """A depth camera on every robot, which follows these simulations."""
-        return DepthCamera(self.world.spec, self.batch, self.num_threads)
+        self._cameras.append(DepthCamera(self.world.spec, self.batch, self.num_threads))
+        return self._cameras[-1]
 
     def state_dict(self) -> dict[str, Any]:
         """Everything an exact continuation needs: integration states, parameters, derived fields last read."""
@@ -256,25 +255,28 @@ class BatchSimulator:
         """Restore what :meth:`state_dict` returned.
 
         Raises:
-            ValueError: if the state belongs to another model or number of simulations.
+            ValueError: if the state belongs to another model, number of simulations or simulator.
         """
-        saved = state["state"].numpy()
-        if saved.shape != self.batch.state.shape:
+        saved = state["state"]
+        found = "several tensors" if isinstance(saved, dict) else tuple(saved.shape)
+        if found != self.batch.state.shape:
             raise ValueError(
-                f"simulator state must be {self.batch.state.shape}, got {saved.shape}; "
-                "resume with the number of robots and the model that wrote it"
+                f"simulator state must be {self.batch.state.shape}, got {found}; resume with the simulator, the number "
+                "of robots and the model that wrote it"
             )
         everyone = torch.ones(self.num_simulations, dtype=torch.bool)
         # What was never set in the saved simulation has its nominal value there, whatever it is here.
         nominal = {name: self._parameters.nominal(name) for name in self._parameters.values}
         self.set_parameters(everyone, **{**nominal, **state["parameters"]})
-        self.batch.state[:] = saved
-        self._warned = self._warning_count()
+        self.batch.state[:] = saved.numpy()
         self._read()
         self._previous_target = state["previous_target"].clone()
         self.contact_force = state["contact_force"].clone()
         self.unstable = state["unstable"].clone()
 
     def close(self) -> None:
-        """Release threads and memory; the simulator cannot be used afterwards."""
-        self.__dict__.pop("batch", None)
+        """Release threads and memory, those of its cameras too; the simulator cannot be used afterwards."""
+        for camera in self.__dict__.pop("_cameras", ()):
+            camera.close()
+        for name in ("batch", *_VIEWS):  # every view keeps the batch alive
+            self.__dict__.pop(name, None)

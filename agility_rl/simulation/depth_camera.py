@@ -117,3 +117,8 @@ class DepthCamera:
         self._batch.forward(mask.numpy(), stage=mujoco.mjtStage.mjSTAGE_VEL)
         depth = torch.from_numpy(self._depth[rows].astype(np.float32)).unflatten(-1, shape)
         return torch.where(depth < 0.0, torch.inf, depth)
+
+    def close(self) -> None:
+        """Release threads and memory; the camera cannot be used afterwards."""
+        for name in ("_batch", "_poses", "_depth"):
+            self.__dict__.pop(name, None)

@@ -22,6 +22,7 @@ class HardwareError(ValueError):
 
 
 _UNKNOWN = "unknown simulator {!r}; expected 'batch' (CPU) or 'warp' (NVIDIA GPU)"
+_OF_WARP = ("device", "max_contacts", "max_constraints")
 PARAMETERS: dict[str, tuple[int, str]] = {
     "stiffness": (12, "N m/rad"),
     "damping": (12, "N m s/rad"),
@@ -83,6 +84,8 @@ class Simulator(Protocol):
         root_angular_velocity: ``[N, 3]`` [rad/s], base frame.
         joint_position: ``[N, 12]`` [rad].
         joint_velocity: ``[N, 12]`` [rad/s].
+        motor_target: ``[N, 12]`` [rad], joint targets that the motors had last: those of the last step, or of the one
+            before where they come later than that; where a robot was put, its joint positions.
         contact_force: ``[N, 17]`` [N], net force on each group of :data:`agility_rl.go2.constants.CONTACT_GROUPS`.
         unstable: bool ``[N]``, the engine reported divergence in the last step.
         scenery: pieces that stand around the robot.
@@ -106,6 +109,7 @@ class Simulator(Protocol):
     root_angular_velocity: Tensor
     joint_position: Tensor
     joint_velocity: Tensor
+    motor_target: Tensor
     contact_force: Tensor
     unstable: Tensor
     scenery: Sequence[Piece]
@@ -182,7 +186,7 @@ def make_simulator(name: str = "batch", *, num_simulations: int, **options: Any)
 
     Args:
         name: ``"batch"`` (CPU, ``mujoco.batch``) or ``"warp"`` (NVIDIA GPU, ``mujoco-warp``: extra ``gpu``), to which
-            ``num_threads`` says nothing.
+            ``num_threads`` says nothing; as little say ``device``, ``max_contacts`` and ``max_constraints`` to the CPU.
         num_simulations: N.
         **options: keyword arguments of the simulator's class.
 
@@ -198,12 +202,12 @@ def make_simulator(name: str = "batch", *, num_simulations: int, **options: Any)
     if name == "batch":
         from agility_rl.simulation.batch import BatchSimulator
 
-        return BatchSimulator(num_simulations, **options)
+        return BatchSimulator(num_simulations, **_without(options, *_OF_WARP))
     if name == "warp":
         with _installed():
             from agility_rl.simulation.warp import WarpSimulator
 
-        return WarpSimulator(num_simulations, **{key: options[key] for key in options if key != "num_threads"})
+        return WarpSimulator(num_simulations, **_without(options, "num_threads"))
     raise ValueError(_UNKNOWN.format(name))
 
 
@@ -229,6 +233,10 @@ def simulator_device(name: str, device: torch.device | str = "cuda") -> torch.de
     with _installed():
         from agility_rl.simulation.warp_device import usable_device
     return usable_device(device)
+
+
+def _without(options: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if name not in names}
 
 
 @contextlib.contextmanager

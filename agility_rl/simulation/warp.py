@@ -28,6 +28,8 @@ _OF_ONE = int(mjw.OverflowType.NEFC | mjw.OverflowType.CCD | mjw.OverflowType.HF
 """What of a simulation did not fit into its own room."""
 _OF_ALL = int(mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE)
 """What of anyone did not fit into the room of all."""
+_VIEWS = ("_qpos", "_qvel", "_ctrl", "_warmstart", "_flags", "_sensordata", "_mocap_position", "_mocap_quaternion")
+"""Attributes that look into the memory of the simulation."""
 _LOOK_EVERY = 500
 """Control steps after which the host looks whether contacts fit; each look makes the GPU wait."""
 
@@ -254,6 +256,7 @@ class WarpSimulator:
         self.root_linear_velocity, self.root_angular_velocity = qvel[:, :3], qvel[:, 3:6]
         self.joint_velocity = qvel[:, JOINT_SPEEDS]
         self.hinge_angle = qpos[:, self._hinges]
+        self.motor_target = self._ctrl.clone()
         self.contact_force = torch.linalg.vector_norm(self._sensordata[:, FORCES].unflatten(-1, (-1, 3)), dim=-1)
 
     def set_parameters(self, mask: Tensor, **fields: Tensor) -> None:
@@ -346,5 +349,5 @@ class WarpSimulator:
 
     def close(self) -> None:
         """Release memory; the simulator cannot be used afterwards."""
-        for name in ("_graph", "_data", "_model"):
+        for name in ("_graph", "_data", "_model", "_parameters", *_VIEWS):
             self.__dict__.pop(name, None)

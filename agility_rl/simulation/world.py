@@ -41,7 +41,7 @@ class World:
         ground_extent: half side of the square in which robots may start [m].
 
     Raises:
-        ValueError: if the steps do not fit each other.
+        ValueError: if the steps do not fit each other, or a height field has no room to start in.
 
     Example:
         >>> World().substeps
@@ -63,6 +63,11 @@ class World:
         self.control_dt, self.sim_dt, self.substeps = control_dt, sim_dt, round(substeps)
         self.ground_extent = 0.0 if terrain is None else min(terrain.half_size) - _TERRAIN_MARGIN
         if terrain is not None:
+            if self.ground_extent <= 0.0:
+                raise ValueError(
+                    f"a height field must reach farther than {_TERRAIN_MARGIN} m from its middle, got half sides of "
+                    f"{terrain.half_size} m"
+                )
             model_options |= {"heights": terrain.heights.numpy(), "height_field_size": terrain.half_size}
         self.scenery: Sequence[Piece] = tuple(scenery)
         self.spec = build_spec(sim_dt=sim_dt, **model_options)

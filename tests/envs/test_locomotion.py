@@ -10,13 +10,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
-from agility_rl import keys
+from agility_rl import keys, rotations
 from agility_rl.behaviours import BEHAVIOURS, RESAMPLE_PERIOD
 from agility_rl.envs import LocomotionEnv
 from agility_rl.envs.locomotion import EDGE
 from agility_rl.envs.randomization import Randomization
 from agility_rl.envs.rewards import LOCOMOTION_REWARDS, RewardTerm, rhythm
-from agility_rl.go2.constants import STANDING_HEIGHT
+from agility_rl.go2 import kinematics
+from agility_rl.go2.constants import FOOT_RADIUS, STANDING_HEIGHT
 from agility_rl.motion import synthesize_gait
 from agility_rl.motion.stride_patterns import stride_patterns
 from agility_rl.simulation import make_simulator, rough_pyramids
@@ -197,7 +198,7 @@ def test_state_dict_restores_the_exact_continuation(build: Build) -> None:
 
 
 def test_a_state_of_another_size_is_refused(build: Build) -> None:
-    with pytest.raises(ValueError, match="resume with the number of robots"):
+    with pytest.raises(ValueError, match="resume with the simulator, the number of robots and the model"):
         build(2).load_state_dict(build(3).state_dict())
 
 
@@ -254,8 +255,23 @@ def test_set_commands_holds_until_told_otherwise(build: Build) -> None:
     assert env.step(carrier.set(keys.ACTION, torch.zeros(2, 12)))["next", keys.SKILL].tolist() == [4, 2]
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"push_interval": 0.0}, "push_interval must be at least a control step, or None for no pushes"),
+        ({"rewards": {}}, "at least one reward term and one termination"),
+        ({"terminations": ()}, "at least one reward term and one termination"),
+    ],
+)
+def test_what_cannot_be_an_environment_is_refused(build: Build, options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build(1, **options)
+
+
 def test_skills_follow_the_prior(build: Build) -> None:
     env = build(40)
+    with pytest.raises(ValueError, match=r"expected \[5\] probabilities, got \[4\]"):
+        env.set_skill_probabilities(torch.ones(4))
     assert RESAMPLE_PERIOD == 6.0
     env.set_skill_probabilities(torch.tensor([0.0, 0.0, 0.5, 0.5, 0.0]))
     assert set(env.reset()[keys.SKILL].tolist()) == {BEHAVIOURS.index("trot"), BEHAVIOURS.index("canter")}
@@ -269,9 +285,17 @@ def test_rough_ground(build: Build) -> None:
     ground = field.height_at(robots.root_position[:, :2])
     assert ground.std() > 0.05 and robots.root_position[:, :2].abs().max() <= robots.ground_extent
     torch.testing.assert_close(first[keys.EXPLICIT][:, 0], robots.root_position[:, 2] - ground)
-    torch.testing.assert_close(
-        first[keys.EXPLICIT][:, 0], torch.full((16,), STANDING_HEIGHT + 0.005), atol=1e-4, rtol=0
-    )
+    # As high above the ground below its trunk as a robot that stands, but where a sole would then be in the ground.
+    feet = kinematics.forward(robots.joint_position)
+    feet = robots.root_position[:, None] + rotations.rotate(robots.root_quaternion[:, None], feet)
+    below = field.height_at(feet[..., :2].flatten(0, 1)).view(16, 4)
+    deepest = (feet[..., 2] - FOOT_RADIUS - below).amin(-1)
+    height = first[keys.EXPLICIT][:, 0]
+    lifted = height > STANDING_HEIGHT + 0.0051
+    assert 0 < lifted.sum() < 16 and (deepest > 0.0049).all()
+    torch.testing.assert_close(deepest[lifted], torch.full_like(deepest[lifted], 0.005), atol=1e-4, rtol=0)
+    standing = torch.full_like(height[~lifted], STANDING_HEIGHT + 0.005)
+    torch.testing.assert_close(height[~lifted], standing, atol=1e-4, rtol=0)
     for _ in range(30):
         after = env.step(TensorDict({keys.ACTION: torch.zeros(16, 12)}, [16]))["next"]
     height = after[keys.EXPLICIT][~after["terminated"][:, 0]][:, 0]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from agility_rl.envs.commands import CommandSampler
-from agility_rl.envs.randomization import Randomization
+from agility_rl.envs.randomization import NOMINAL, Randomization
 from agility_rl.envs.robots import STRIDE, Pushes, Robots
 from agility_rl.go2 import constants, features
 from agility_rl.simulation import make_simulator
@@ -30,6 +32,34 @@ def test_an_action_of_one_asks_for_the_default_pose_and_the_scale() -> None:
     robots.step(torch.zeros(1, 12))
     later = robots.state(torch.zeros(1, 12), commands)
     assert torch.equal(later.previous_action, torch.ones(1, 12)) and torch.equal(later.previous_torque, state.torque)
+
+
+def test_torques_are_towards_the_targets_that_the_motors_have() -> None:
+    """Robots 0 to 2 get targets at once, after two physics steps, and with the next control step."""
+    robots, commands = build(3)
+    everyone = torch.ones(3, dtype=torch.bool)
+    robots.simulator.set_parameters(everyone, action_delay=torch.tensor([[0.0], [0.01], [0.02]]))
+    robots.begin(everyone, commands)
+    held = robots.simulator.joint_position  # where they were put
+    for value in (1.0, -1.0):
+        action = torch.full((3, 12), value)
+        robots.step(action)
+        state = robots.state(action, commands)
+        asked = torch.tensor(constants.DEFAULT_POSE) + torch.tensor(constants.ACTION_SCALE) * action
+        there = torch.cat((asked[:2], held[2:]))
+        assert torch.equal(robots.simulator.motor_target, there)
+        torch.testing.assert_close(state.torque, 40.0 * (there - state.joint_position) - state.joint_velocity)
+        held = asked
+
+
+def test_a_delay_ends_where_there_is_none_any_more() -> None:
+    robots, _ = build(2)
+    everyone = torch.ones(2, dtype=torch.bool)
+    robots.randomize(everyone, replace(NOMINAL, action_delay=(0.02, 0.02)))
+    assert robots.simulator.parameter("action_delay").tolist() == [[pytest.approx(0.02)]] * 2
+    robots.load_state_dict(robots.state_dict())
+    robots.randomize(everyone, NOMINAL)
+    assert robots.simulator.parameter("action_delay").tolist() == [[0.0]] * 2
 
 
 def test_heights_count_from_the_given_ground_and_peaks_last_their_window() -> None:

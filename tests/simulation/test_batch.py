@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import mujoco
@@ -194,6 +195,10 @@ def test_divergence_is_flagged_once_and_only_there(tmp_path: Path, monkeypatch: 
     simulator.step(POSE.repeat(3, 1))
     assert simulator.unstable.tolist() == [False, False, True]
     assert torch.isfinite(simulator.joint_position).all()
+    simulator.step(POSE.repeat(3, 1))
+    simulator.batch.bind("qpos")[2, 8] = np.nan
+    simulator.step(POSE.repeat(3, 1))
+    assert simulator.unstable.tolist() == [False, False, True], "a second time too, without a reset between"
     simulator.reset(only(3, 2), **standing(3))
     assert not simulator.unstable.any()
 
@@ -237,7 +242,20 @@ def test_state_of_another_size_is_refused() -> None:
         BatchSimulator(3, num_threads=1).load_state_dict(saved)
 
 
+def test_state_of_the_other_simulator_is_refused() -> None:
+    simulator = BatchSimulator(2, num_threads=1)
+    with pytest.raises(ValueError, match="got several tensors; resume with the simulator"):
+        simulator.load_state_dict({**simulator.state_dict(), "state": {"qpos": torch.zeros(2, 19)}})
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="counts threads as Linux does")
 def test_closing_releases_the_batch() -> None:
-    simulator = BatchSimulator(1, num_threads=1)
+    before = len(os.listdir("/proc/self/task"))
+    simulator = BatchSimulator(4, num_threads=3)
+    camera = simulator.make_camera()
+    simulator.step(POSE.repeat(4, 1))
+    camera.render(everyone(4))
+    assert len(os.listdir("/proc/self/task")) > before
     simulator.close()
-    assert not hasattr(simulator, "batch")
+    simulator.close()
+    assert not hasattr(simulator, "batch") and len(os.listdir("/proc/self/task")) == before

@@ -25,6 +25,11 @@ def test_parameters_have_sizes_and_units() -> None:
     assert PARAMETERS["stiffness"] == (12, "N m/rad")
 
 
+def test_options_of_the_gpu_say_nothing_on_the_cpu() -> None:
+    simulator = make_simulator("batch", num_simulations=1, num_threads=1, device="cpu", max_contacts=9)
+    assert simulator.device.type == "cpu"
+
+
 def test_unknown_backend_is_named() -> None:
     with pytest.raises(ValueError, match="'physx'"):
         make_simulator("physx", num_simulations=1)

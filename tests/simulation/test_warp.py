@@ -32,6 +32,7 @@ def both(n: int, **options: object) -> tuple[WarpSimulator, BatchSimulator]:
 def assert_agree(warp: WarpSimulator, batch: BatchSimulator, tolerance: float) -> None:
     for name in ("root_position", "root_quaternion", "joint_position", "hinge_angle"):
         torch.testing.assert_close(getattr(warp, name), getattr(batch, name), atol=tolerance, rtol=0.0)
+    torch.testing.assert_close(warp.motor_target, batch.motor_target)
     torch.testing.assert_close(warp.joint_velocity, batch.joint_velocity, atol=100 * tolerance, rtol=0.0)
     torch.testing.assert_close(warp.contact_force, batch.contact_force, atol=FORCE_TOLERANCE, rtol=0.01)
 
