@@ -20,7 +20,7 @@ from torch import Tensor
 
 from agility_rl import keys
 from agility_rl.behaviours import NUM_BEHAVIOURS
-from agility_rl.envs import COURSES, AgilityEnv, LocomotionEnv
+from agility_rl.envs import COURSES, AgilityEnv
 from agility_rl.envs.decisions import NUM_PARAMETERS
 from agility_rl.go2 import constants
 
@@ -73,18 +73,6 @@ def stepper(env: AgilityEnv, given: GivenTargets) -> Callable[[Tensor], None]:
     return step
 
 
-def locomotion(robots: int, threads: int) -> Callable[[Tensor], None]:
-    """The plain environment, for comparison: its share of the engine without a course."""
-    env = LocomotionEnv(robots, simulator_options={"num_threads": threads})
-    env.reset()
-    pose, scale = torch.tensor(constants.DEFAULT_POSE), torch.tensor(constants.ACTION_SCALE)
-
-    def step(target: Tensor) -> None:
-        env.step(TensorDict({keys.ACTION: (target - pose) / scale}, [robots]))
-
-    return step
-
-
 def main() -> None:
     """Run all contenders in turns and print their rates."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -110,7 +98,6 @@ def main() -> None:
         "simulator": plain.step,
         "env.step, 50 decisions/s": stepper(first, given),
         "env.step, 10 decisions/s": stepper(fifth, given_fifth),
-        "LocomotionEnv.step, no course": locomotion(robots, threads),
     }
     targets = turns.shifting_weight(options.steps, robots)
     steppers = {name: turns.through(step, targets) for name, step in contenders.items()}

@@ -159,10 +159,13 @@ def bare_batch(robots: int, threads: int) -> Callable[[Tensor], None]:
     return step
 
 
-def bare_warp(robots: int, device: torch.device) -> tuple[Callable[[Tensor], None], Tensor, Tensor]:
-    """Mujoco-warp alone, on a GPU as a CUDA graph; beside it positions and velocities of its robots."""
+def bare_warp(robots: int, device: torch.device, model: Any = None) -> tuple[Callable[[Tensor], None], Tensor, Tensor]:
+    """Mujoco-warp alone, on a GPU as a CUDA graph; beside it positions and velocities of its robots.
+
+    The model must be that of what it is compared with: dry friction alone is 12 constraints more for every robot.
+    """
     with warp.ScopedDevice(warp.device_from_torch(device)):
-        model = build_spec(sim_dt=constants.SIM_DT).compile()
+        model = build_spec(sim_dt=constants.SIM_DT).compile() if model is None else model
         there = mujoco_warp.put_model(model)
         data = mujoco_warp.make_data(model, robots, nconmax=48, njmax=306)
         position, velocity, command = (warp.to_torch(array) for array in (data.qpos, data.qvel, data.ctrl))

@@ -1,7 +1,8 @@
 """Is the teacher's recipe slower than a plain PyTorch loop? Both run in turns, on the same course and settings.
 
 The plain loop is Hybrid-PPO written by hand: plain networks of the same sizes, the same minibatches, epochs and losses
-as the given preset of ``recipes/tsc_teacher.py``, preallocated memory, fused optimisers, float32. Both step the same
+as the given preset of ``recipes/tsc_teacher.py`` (those whose teacher reads its place and learns from the chosen
+behaviour's parameters), preallocated memory, fused optimisers, float32. Both step the same
 kind of environment, which holds the controller; the plain one keeps no statistics of obstacles and leaves curriculum
 and moving average out.
 
@@ -217,7 +218,10 @@ def density(mean: Tensor, std: Tensor, action: Tensor) -> Tensor:
 def main() -> None:
     """Run both loops in turns and print the time of each phase."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", default="cpu", help="preset of tsc_teacher.py whose settings both loops take")
+    alike = [name for name, cfg in recipe.PRESETS.items() if cfg.ppo.continuous == "selected" and cfg.place]
+    parser.add_argument(
+        "--preset", default="cpu", choices=alike, help="preset of tsc_teacher.py whose settings both loops take"
+    )
     parser.add_argument("--iterations", type=int, default=10, help="timed iterations of each loop, run in turns")
     parser.add_argument("--warmup", type=int, default=2, help="iterations of each loop before the timing")
     parser.add_argument("--robots", type=int, help="another number of robots")

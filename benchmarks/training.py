@@ -88,10 +88,10 @@ def bare_batch(env: LocomotionEnv) -> Bare:
 
 
 def bare_warp(env: LocomotionEnv) -> Bare:
-    """Mujoco-warp on the device of the environment."""
+    """Mujoco-warp on the same model and device."""
     import engines  # needs mujoco-warp
 
-    step, position, velocity = engines.bare_warp(env.num_robots, env.device)
+    step, position, velocity = engines.bare_warp(env.num_robots, env.device, env.simulator.model)
 
     def begin() -> None:
         state = env.simulator

@@ -59,6 +59,7 @@ class Config:
     every: int = 4
     """Decisions between two images of a robot."""
     robots: int = 32
+    """Simulated together."""
     strength: int = 1
     """How many times images are disturbed."""
     seed: int = 2000

@@ -42,6 +42,7 @@ class MotionConfig:
 @dataclass(frozen=True)
 class EnvConfig:
     num_robots: int = 1024
+    """Of each process (released: 4096; method notes, section 3.7)."""
     terrain: Literal["flat", "rough", "ridges"] = "flat"
     """``flat``, ``rough`` (method notes 4.5), or ``ridges``: slopes without roughness (ours)."""
     roughness: float = 0.05
@@ -62,9 +63,11 @@ class EnvConfig:
     shares: tuple[float, ...] = ()
     """How often each of the five behaviours is commanded, in place of the prior (ours)."""
     randomize: bool = True
+    """Friction, mass, centre of mass and gains (method notes, section 4.5)."""
     push_interval: float | None = 8.0
     """Seconds (released code)."""
     observation_noise: float = 1.0
+    """Factor on the noise of the observations (method notes, section 3.2); 0: none."""
     action_delay: float = 0.0
     """Delay of every action [s]."""
     action_delay_from: int = 0
@@ -72,6 +75,7 @@ class EnvConfig:
     jump_reward: Literal["peak", "window"] = "peak"
     """``window`` as released, or ``peak``: the highest trunk of the last 0.9 s."""
     jump_weight: float = 6.0
+    """Weight of the reward for the height of jumps (ours; released: 0.2, with ``window``)."""
     jump_width: float = 0.01
     """Width of the kernel of ``peak`` [m^2]."""
     progress_weight: float = 0.0
@@ -89,14 +93,11 @@ class EnvConfig:
     walk_growth: float = FREQUENCY_GROWTH["walk"]
     """Strides that a second shall hold more of for each m/s that the walk is commanded faster [1/m]."""
     walk_emphasis: float = 1.0
-    """How many times as much the walk's rhythm is paid as that of the other behaviours (ours): of the most that it can
-    earn by it, ``pretrained/bbc`` earns 0.28 when it walks, 0.59 to 0.83 else."""
+    """How many times as much the walk's rhythm is paid as that of others (ours; docs/bbc_experiments.md)."""
     canter_stance: float = 0.0
     """Share of time for which a cantering foot shall stand more than in the labelled clips (ours). Those run at 1.9 to
     3.3 m/s, commands at 0.8 to 2: a robot that has to stand as shortly as they do goes faster than told. Dogs cantering
-    in the unlabelled clips stand for 0.47 of the time at 0.86 m/s, 0.41 at 1.23, 0.35 at 1.66, 0.32 at 2.11
-    (:func:`~agility_rl.motion.gait_analysis.stance_share`, 56 stretches of 1.2 s): 0.06 more than the labelled ones at
-    the mean commanded speed."""
+    at the mean commanded speed stand for 0.06 more than the labelled ones (docs/bbc_experiments.md, The rhythm)."""
     collision_weight: float = -10.0
     """Supplement S4. As the sum is clipped at zero, a beginner who collides learns nothing else; less is faster."""
     episode_length: float = 20.0
@@ -110,19 +111,23 @@ class EnvConfig:
     friction_loss: float = 0.2
     """Dry friction of the joints [N m]; 0 as in the released simulation is a tenth faster."""
     simulator: Path | None = None
-    """Identified simulator to train in: ``result.json`` of ``easi.py``. What it tells takes the place of the
-    randomisation; the rest is as ``randomize`` says."""
+    """Identified simulator to train in: ``result.json`` of ``easi.py``; the rest is as ``randomize`` says."""
     num_threads: int | None = None
+    """Of the simulator on a CPU; all by default. They do not change the result."""
 
 
 @dataclass(frozen=True)
 class PPOConfig:
     steps: int = 24
+    """Control steps of a roll-out (method notes, section 3.7)."""
     epochs: int = 5
+    """Passes over a roll-out (method notes, section 3.7)."""
     minibatches: int = 8
+    """Of a pass (released: 4; method notes, section 3.7)."""
     learning_rate: float = 1e-3
     """Table S1."""
     max_learning_rate: float = 1e-2
+    """How far ``desired_kl`` may raise the rate (method notes, section 3.7)."""
     desired_kl: float | None = 0.01
     """Released code; ``None`` keeps the learning rate."""
     clip: float = 0.2
@@ -137,14 +142,13 @@ class PPOConfig:
     value: float = 1.0
     """Weight of the critic's squared error, which is not clipped (released: clipped)."""
     max_grad_norm: float = 1.0
+    """Method notes, section 3.7."""
     precision: Precision = "float32"
     """Of the hidden layers in the update; ``auto`` is bfloat16 on hardware that multiplies in it."""
     compile: bool = False
-    """Fuse PPO's loss, and policy and critic of roll-outs, by ``torch.compile``: a minute once, then faster
-    (docs/gpu.md)."""
+    """Fuse PPO's loss, and policy and critic of roll-outs, by ``torch.compile``: half a minute once (docs/gpu.md)."""
     averaging: float = 0.0
-    """What is saved is a moving average of the controller's weights with this decay an iteration, so that less hangs on
-    which iteration was the last; 0: the last weights. Ours (docs/bbc_experiments.md, The rhythm)."""
+    """Decay an iteration of the weights' moving average, which is saved (ours; docs/bbc_experiments.md); 0: none."""
     by_behaviour: bool = False
     """Normalise advantages within each behaviour (ours); over all of them, one that is paid more is learned at the
     others' expense."""
@@ -154,9 +158,9 @@ class PPOConfig:
     symmetric: tuple[str, ...] = ("walk", "pace", "trot")
     """Behaviours that are held to that. Gaits with a leading leg are not: between one and its image lies another."""
     initial_std: float = 1.0
+    """Deviation of an action at the start (method notes, section 3.1)."""
     min_std: float = 0.1
-    """Least deviation of an action, alike for all joints (ours; released: 0.05, 0.02 and 0.05 of the joints' ranges,
-    which is 0.094, 0.091 and 0.085)."""
+    """Least deviation of an action, alike for all joints (ours; released: 0.094, 0.091 and 0.085 of the three)."""
     hidden: tuple[int, ...] = (512, 256, 128)
     """Supplement S6."""
     critic_warm_up: int = 0
@@ -168,13 +172,17 @@ class PPOConfig:
 @dataclass(frozen=True)
 class ImitationConfig:
     criterion: Literal["least_squares", "logistic", "wasserstein"] = "least_squares"
+    """Of the discriminator: least squares, or an alternative that the release has too (method notes, section 3.4)."""
     conditional: bool = False
     """Tell the discriminator the skill (ours; the paper's does not know it)."""
     labelled_share: float = 0.0
     """Share of labelled motion in the discriminator's expert batch."""
     minibatches: int = 80
+    """Of an iteration (method notes, section 3.3)."""
     batch_size: int = 1228
+    """Frames of the policy, and of unlabelled motion, in a minibatch (method notes, section 3.3)."""
     labelled_batch_size: int = 1228
+    """Frames of labelled motion in it (method notes, section 3.3)."""
     replay: int = 1_000_000
     """Policy frames kept (released code)."""
     discriminator_learning_rate: float = 5e-4
@@ -183,7 +191,9 @@ class ImitationConfig:
     """Table S1. It is the rate of class and shift heads; the trunk that they share has the discriminator's (ours;
     released: three optimisers, each of which moves the trunk too)."""
     weight_decay: float = 1e-3
+    """Of discriminator and predictor (method notes, section 3.4)."""
     gradient_penalty: float = 0.1
+    """Coefficient of the squared slope at unlabelled motion (method notes, section 3.4)."""
     cloning: int = 0
     """Steps in which the actor copies the labelled clips before anything else."""
     cloning_weight: float = 0.0
@@ -201,6 +211,7 @@ class ImitationConfig:
     warm_up: int = 0
     """Steps in which the predictor learns the labels before anything else, so that its first rewards mean something."""
     information: float = 1.0
+    """Coefficient of the information-maximisation term (method notes, section 3.4)."""
     information_ramp: tuple[int, int] = (200, 10_000)
     """First iteration and length of the ramp of the information-maximisation term (released code)."""
     prior_weight: float = 1e-3
@@ -211,12 +222,14 @@ class ImitationConfig:
     imitation_reward: float = 0.2
     """Table S1 (released code: 1.0)."""
     skill_reward: float = 0.2
+    """Weight of log Q^c(c) (released code; method notes, section 3.6)."""
     skill_floor: float | None = None
     """Lift log Q^c to [0, 1] above this floor, so that no reward punishes being alive; ``None`` as published."""
     gate: float = 0.0
     """Share of imitation and skill reward that is paid only in proportion to ``velocity_progress`` (needs a weight for
     it): a standing robot is no bad imitation of a slow dog, and would be content."""
     shift_reward: float = 0.01
+    """Weight of the predicted shift (released code; method notes, section 3.6)."""
     task_reward: float = 0.2
     """Table S1."""
     height_deviation: float = 0.0
@@ -226,11 +239,13 @@ class ImitationConfig:
     """Weight of joint and turning velocities in what discriminator and predictor see. A dog's are smooth; a robot's
     jump at every contact and exploring action, by which it is told apart however well it walks."""
     hidden: tuple[int, ...] = (512, 256)
+    """Layers that discriminator and predictor share (method notes, section 3.1)."""
 
 
 @dataclass(frozen=True)
 class AdaptationConfig:
     learning_rate: float = 1e-4
+    """Of history encoder and estimator (method notes, section 3.7)."""
     every: int = 20
     """Iterations between roll-outs that use the history encoder (released code)."""
     minibatches: int = 8
@@ -239,6 +254,7 @@ class AdaptationConfig:
     privileged: float = 0.1
     """Weight of pulling the privileged encoder towards the history encoder (released code)."""
     privileged_ramp: tuple[int, int] = (1000, 2000)
+    """First iteration and length of the ramp of that weight (method notes, section 3.7)."""
 
 
 @dataclass(frozen=True)
@@ -261,11 +277,15 @@ class Config(HardwareConfig):
     name: str = "bbc"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
+    """Folder of all runs."""
     seed: int = 0
+    """Of everything that is drawn."""
     iterations: int = 200_000
+    """Released code: 200,000 take four days (method notes, section 3.7)."""
     max_minutes: float | None = None
     """Stop and save after this time."""
     checkpoint_every: int = 50
+    """Iterations."""
     resume: Path | None = None
     """Run folder to go on with."""
     init_from: Path | None = None

@@ -63,7 +63,9 @@ class Config:
     name: str = "distilled"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
+    """Folder of all runs."""
     seed: int = 0
+    """Of everything that is drawn."""
     teachers: tuple[tuple[str, Path], ...] = ()
     """Behaviour and run or artifact folder, for each of the five behaviours. The first one's network is the student's,
     and its weights are where the student starts."""
@@ -74,6 +76,7 @@ class Config:
     env: bbc_config.EnvConfig = field(default_factory=lambda: ENVIRONMENT)
     """Where they walk. The joints' dry friction is that of the teachers' simulator; rewards are not used."""
     rounds: int = 24
+    """Roll-outs, each followed by learning from the newest ones."""
     teacher_rounds: int = 2
     """First rounds in which the teachers act."""
     steps: int = 50
@@ -83,7 +86,9 @@ class Config:
     updates: int = 150
     """Of a round."""
     batch_size: int = 4096
+    """Rows of a gradient step."""
     learning_rate: float = 1e-3
+    """At first; it falls to a twentieth."""
     noise: float = 0.2
     """Standard deviation of what is added to the actions that are taken, in action units; labels are without."""
     motion: MotionConfig = field(default_factory=MotionConfig)

@@ -41,7 +41,9 @@ class Config:
     name: str = "finetune"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
+    """Folder of all runs."""
     seed: int = 0
+    """Of training and comparison."""
     init_from: Path | None = None
     """Run or artifact folder of the BBC."""
     simulator: Path | None = None
@@ -53,6 +55,7 @@ class Config:
     iterations: int | None = None
     """Iterations of the training, instead of the preset's."""
     num_threads: int | None = None
+    """Of the simulator; all by default. They do not change the result."""
     episodes: int = 50
     """Episodes of each behaviour in the comparison."""
     seconds: float = 20.0

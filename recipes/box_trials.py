@@ -60,7 +60,9 @@ class Config:
     turned: float = 0.1
     """How far a box is turned at most [rad]."""
     seed: int = 0
+    """Of starts and commands."""
     num_threads: int | None = None
+    """Of the simulator; all by default."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from tsc_script import read
 from agility_rl import behaviours, keys
 from agility_rl.behaviours import FASTEST_CANTER
 from agility_rl.envs import AgilityEnv
+from agility_rl.envs.course import Course
 from agility_rl.envs.depth import DepthObservation
 from agility_rl.modules import RecurrentStudent
 from agility_rl.modules.student import NEXT_HIDDEN
@@ -102,6 +103,12 @@ class Decider:
     def kind(self) -> str:
         """``teacher``, ``student`` or ``script``."""
         return str(self.manifest.get("kind", "script"))
+
+    def knows(self, course: Course) -> bool:
+        """Whether a student that knows where obstacles stand knows it of this course, if there is more than one."""
+        known = None if self.student is None else self.student.settings.get("routes")
+        stands = [[list(leg) for leg in route] for route in course.legs]
+        return known is None or known == stands or all(len(route) == 1 for route in stands)
 
     def senses(self, env: AgilityEnv, disturbance: Disturbance, seed: int) -> Senses | None:
         """What a student needs besides the observations of an environment."""

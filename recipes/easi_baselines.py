@@ -76,12 +76,15 @@ class Config:
     name: str = "easi_baselines"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
+    """Folder of all runs."""
     seed: int = 0
     """Of targets, noise and searches."""
     targets: int = 10
     """Targets of every condition."""
     conditions: tuple[str, ...] = tuple(CONDITIONS)
+    """What the logs and the first range are like, by name."""
     methods: tuple[str, ...] = tuple(METHODS)
+    """What is compared, by name."""
     steps: int = 4000
     """Rows of a log: 80 s (supplement S2)."""
     window: int | None = None

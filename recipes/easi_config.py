@@ -74,7 +74,9 @@ class Config:
     name: str = "easi"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
+    """Folder of all runs."""
     seed: int = 0
+    """Of everything that is drawn."""
     log: Path | None = None
     """Robot log: .mcap, .csv or .npz."""
     policy: Path | None = None

@@ -203,6 +203,8 @@ def evaluate(config: Config, console: Console) -> dict[str, Any]:
             course, label, file = courses[name], name, files[name]
             if key != "none":
                 label, file = f"{name}, {disturbances[key].label}", f"{file}_{key}"
+            if not decider.knows(course):
+                console.print(f"{name}: obstacles stand elsewhere than {decider.name} knows, so that it loses its way")
             task = bar.add_task(label, total=config.episodes)
             episodes = simulate(course, decider, config, partial(bar.advance, task), disturbances[key])
             found[label] = summarise(course, episodes)

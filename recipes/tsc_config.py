@@ -19,6 +19,7 @@ from agility_rl.training.precision import Precision
 @dataclass(frozen=True)
 class RobotsConfig:
     num_robots: int = 512
+    """Of each process (released: 6144 for teachers, 256 for students; method notes, section 5.9)."""
     randomize: bool = True
     """Friction, mass, centre of mass and one step of action delay (method notes, section 5.11)."""
     push_interval: float | None = 8.0
@@ -36,6 +37,7 @@ class RobotsConfig:
     """Distance at which a way-point is reached [m]: 0.4 for teachers, 0.45 for students and in the evaluation (method
     notes, section 5.5)."""
     num_threads: int | None = None
+    """Of the simulator on a CPU; all by default. They do not change the result."""
 
 
 @dataclass(frozen=True)
@@ -55,14 +57,18 @@ class EnvConfig(RobotsConfig):
 @dataclass(frozen=True)
 class PPOConfig:
     steps: int = 24
+    """Decisions of a roll-out (method notes, section 5.9)."""
     epochs: int = 5
+    """Passes over a roll-out (method notes, section 3.7)."""
     minibatches: int = 4
+    """Of a pass (method notes, section 3.7)."""
     learning_rate: float = 5e-4
     """Table S4."""
     critic_learning_rate: float | None = None
     """The critic's own, which stays; without, it learns at the policy's rate, so hardly where small steps are asked
     for (ours)."""
     max_learning_rate: float = 1e-2
+    """How far ``desired_kl`` may raise the rate (method notes, section 3.7)."""
     desired_kl: float | None = 0.01
     """Of the continuous part (method notes, sections 3.7 and 5.2)."""
     clip: float = 0.2
@@ -79,12 +85,13 @@ class PPOConfig:
     """Weight of means beyond [-1, 1], where the environment clips the parameters and nothing that is tried makes a
     difference (ours)."""
     value: float = 1.0
+    """Weight of the critic's squared error."""
     max_grad_norm: float = 1.0
+    """Method notes, section 3.7."""
     precision: Precision = "float32"
     """Of the hidden layers in the update; ``auto`` is bfloat16 on hardware that multiplies in it."""
     compile: bool = False
-    """Fuse PPO's loss, and policy and critic of roll-outs, by ``torch.compile``: a minute once, then faster
-    (docs/gpu.md)."""
+    """Fuse PPO's loss, and policy and critic of roll-outs, by ``torch.compile``: half a minute once (docs/gpu.md)."""
     averaging: float = 0.0
     """What is saved is a moving average of the teacher's weights with this decay an iteration; 0: the last weights
     (ours)."""
@@ -142,17 +149,23 @@ class CloningConfig:
     smoothing: float = 0.1
     """Share of the label that is spread over all behaviours, so that PPO goes on trying each."""
     learning_rate: float = 1e-3
+    """Of the copying."""
     epochs: int = 4
+    """Passes over a roll-out."""
     minibatches: int = 8
+    """Of a pass."""
 
 
 @dataclass(frozen=True)
 class AdaptationConfig:
     learning_rate: float = 1e-4
+    """Of history encoder and estimator (method notes, section 3.7)."""
     every: int = 20
     """Iterations between roll-outs that use the history encoder (released code)."""
     minibatches: int = 8
+    """Steps by which both learn from every roll-out (ours)."""
     privileged: float = 0.1
+    """Weight of pulling the privileged encoder towards the history encoder (method notes, section 3.7)."""
     privileged_ramp: tuple[int, int] = (500, 1000)
     """First iteration and length (method notes, section 5.9)."""
 
@@ -178,7 +191,9 @@ class Config(HardwareConfig):
     name: str = "teacher"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
+    """Folder of all runs."""
     seed: int = 0
+    """Of everything that is drawn."""
     bbc: Path = Path("pretrained/bbc_leaping")
     """Run or artifact folder of the Basic Behaviour Controller."""
     iterations: int = 30_000
@@ -186,6 +201,7 @@ class Config(HardwareConfig):
     max_minutes: float | None = None
     """Stop and save after this time."""
     checkpoint_every: int = 50
+    """Iterations."""
     resume: Path | None = None
     """Run folder to go on with."""
     init_from: Path | None = None

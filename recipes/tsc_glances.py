@@ -51,8 +51,11 @@ class Config:
     name: str = "glances"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
+    """Folder of all runs."""
     minutes: float = 10.0
+    """Learn for so long."""
     batch: int = 128
+    """Images of a gradient step."""
     learning_rate: float = 1.5e-3
     """At first."""
     held_out: float = 0.1
@@ -71,6 +74,7 @@ class Config:
     says where obstacles are."""
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
     seed: int = 0
+    """Of everything that is drawn."""
 
 
 def check(cfg: Config) -> None:

@@ -45,6 +45,7 @@ class Config:
     name: str = "images"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
+    """Folder of all runs."""
     minutes: float = 10.0
     """Stop after this time."""
     windows: int = 1_000_000
@@ -59,9 +60,11 @@ class Config:
     episode_length: float = 40.0
     """Seconds."""
     num_robots: int = 64
+    """Simulated together."""
     num_threads: int = 1
     """Of this process."""
     seed: int = 0
+    """Of everything that is drawn."""
 
 
 def check(cfg: Config) -> None:

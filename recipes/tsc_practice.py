@@ -62,15 +62,19 @@ class Config(HardwareConfig):
     name: str = "practised"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
+    """Folder of all runs."""
     seed: int = 0
+    """Of everything that is drawn."""
     student: Path = Path("pretrained/student_leaping")
     """Run or artifact folder of the student."""
     bbc: Path | None = None
     """Run or artifact folder of the Basic Behaviour Controller that it was trained on; found by default."""
     iterations: int = 400
+    """Roll-outs, each followed by an update."""
     max_minutes: float | None = 60.0
     """Stop and save after this time."""
     checkpoint_every: int = 25
+    """Iterations."""
     resume: Path | None = None
     """Run folder to go on with."""
     precision: Precision = "auto"

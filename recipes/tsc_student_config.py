@@ -47,11 +47,17 @@ class AugmentationConfig:
     rectangle: float = 0.1
     """Probability for an image (method notes, section 5.10, as all of these)."""
     white_noise: float = 0.1
+    """Probability for an image."""
     white_noise_std: float = 0.02
+    """Deviation of its pixels, of images in [-0.5, 0.5]."""
     dropout: float = 0.05
+    """Probability for an image."""
     dropout_share: float = 0.05
+    """Share of its pixels."""
     blur: float = 0.1
+    """Probability for an image."""
     blur_std: tuple[float, float] = (0.5, 1.5)
+    """Range of its deviation [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -59,17 +65,23 @@ class ImitationConfig:
     steps: int = 24
     """Of a window, through which the gradient passes (method notes, section 5.9)."""
     epochs: int = 1
+    """Passes over a window."""
     minibatches: int = 1
     """Of robots; one gradient step an iteration (method notes, section 5.9)."""
     learning_rate: float = 1e-3
+    """At first (method notes, section 5.9)."""
     final_learning_rate: float = 1e-5
+    """At the end (method notes, section 5.9)."""
     decay: int = 20_000
     """Iterations over which the learning rates fall linearly (method notes, section 5.9)."""
     max_grad_norm: float = 1.0
     """Method notes, section 5.9."""
     behaviour: float = 1.0
+    """Coefficient of the cross-entropy of the behaviour."""
     continuous: float = 1.0
+    """Coefficient of the distance of the parameters."""
     heading: float = 1.0
+    """Coefficient of the errors of the headings."""
     obstacle: float = 1.0
     """Coefficients of the four terms of Eq. (15): all 1 (method notes, section 5.9)."""
     place: float = 0.25
@@ -97,9 +109,11 @@ class ImitationConfig:
 @dataclass(frozen=True)
 class RepresentationConfig:
     hidden: int = 1024
+    """Hidden units of projector and predictor (method notes, section 5.10)."""
     out_features: int = 64
     """Sizes of projector and predictor (method notes, section 5.10)."""
     learning_rate: float = 3e-4
+    """At first (method notes, section 5.10)."""
     final_learning_rate: float = 1e-5
     """Method notes, section 5.10; falls as that of the imitation does."""
     decay: float = 0.99
@@ -127,7 +141,9 @@ class GlanceConfig:
     pretrain_learning_rate: float = 1e-3
     """Of the pre-training; falls along half a cosine to 0."""
     batch: int = 128
+    """Images of a gradient step."""
     learning_rate: float = 1e-3
+    """During the imitation, at first."""
     final_learning_rate: float = 1e-4
     """During the imitation; falls as that of the imitation does."""
     kept: int = 40_000
@@ -143,8 +159,11 @@ class EstimationConfig:
     robots: int = 128
     """That the teacher leads over the course, without cameras."""
     decisions: int = 1000
+    """Of each robot."""
     epochs: int = 10
+    """Passes over them."""
     batch: int = 512
+    """Decisions of a gradient step."""
     learning_rate: float = 2e-3
     """Falls to 0, epoch by epoch."""
 
@@ -154,7 +173,9 @@ class Config(HardwareConfig):
     name: str = "student"
     """Folder under ``runs``."""
     runs: Path = Path("runs")
+    """Folder of all runs."""
     seed: int = 0
+    """Of everything that is drawn."""
     teacher: Path = Path("pretrained/teacher_wary")
     """Run or artifact folder of the teacher; the student decides as often, on the same behaviours."""
     bbc: Path | None = None
@@ -164,6 +185,7 @@ class Config(HardwareConfig):
     max_minutes: float | None = None
     """Stop and save after this time."""
     checkpoint_every: int = 100
+    """Iterations."""
     resume: Path | None = None
     """Run folder to go on with."""
     init_from: Path | None = None

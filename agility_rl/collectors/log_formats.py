@@ -34,6 +34,7 @@ from __future__ import annotations
 import csv
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -144,6 +145,8 @@ def _read_csv(path: Path) -> dict[str, Any]:
             rows = list(csv.reader(file))
     except UnicodeDecodeError as error:
         raise RobotLogError(f"{path} is no text in UTF-8: {error}") from error
+    except csv.Error as error:
+        raise RobotLogError(f"{path} is no CSV file: {error}; look for a stray quotation mark") from error
     if not rows:
         raise RobotLogError(f"{path} is empty")
     header = [name.strip() for name in rows[0]]
@@ -185,10 +188,14 @@ def _read_npz(path: Path) -> dict[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise RobotLogError(f"{path} is damaged or no npz file: {str(error).splitlines()[0]}") from error
+    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise RobotLogError(f"{path} is damaged or no npz file: {reason}") from error
     if "joint_names" not in arrays:
         raise RobotLogError(f"{path} has no joint_names; without them the order of its joints cannot be checked")
+    for name, value in arrays.items():
+        if value.ndim < (2 if name in GROUPS else 1):
+            raise RobotLogError(f"{path}: {name} must have a row for each control step, got the shape {value.shape}")
     check_names(f"{path}: joint_names", [str(name) for name in arrays["joint_names"]], constants.JOINT_NAMES)
     known = {name: value for name, value in arrays.items() if name in GROUPS or name in ("time", "start")}
     for name, value in known.items():

@@ -118,10 +118,13 @@ class RobotLog:
             if group not in columns:
                 either = " (or quaternion)" if group == "roll_pitch" else ""
                 raise RobotLogError(f"{name} has no {group}{either}; it has {', '.join(sorted(columns)) or 'nothing'}")
-        start = columns.get("start", torch.zeros(len(columns["time"])))
+        start = columns.get("start", torch.zeros(len(columns["time"]))).reshape(-1)
+        if len(wrong := ((start != 0) & (start != 1)).nonzero()):
+            row = int(wrong[0])
+            raise RobotLogError(f"{name}: row {row}, start: expected 0 or 1, got {float(start[row]):g}")
         return cls(
             **{group: columns[group] for group in needed},
-            start=start.reshape(-1).bool(),
+            start=start.bool(),
             linear_acceleration=columns.get("linear_acceleration"),
             control_dt=control_dt,
             name=name,

@@ -16,8 +16,10 @@ from agility_rl.envs.obstacles import OBSTACLES, Obstacle, Points
 GOAL_DISTANCE = 4.0
 """A robot further than this from its goal has lost its way [m] (method notes, section 5.6)."""
 LONGEST_WAY = 3.5
-"""Longest way between two way-points [m]: the next one counts when a robot is within the radius of goals of the first,
-up to 0.45 m before it, and whoever is farther from it than :data:`GOAL_DISTANCE` is lost."""
+"""Longest way between two way-points [m]."""
+FARTHEST = GOAL_DISTANCE - 0.45
+"""The same wherever jitter has moved them [m]: the next one counts when a robot is within the radius of goals of the
+first, up to 0.45 m before it, and whoever is farther from it than :data:`GOAL_DISTANCE` is lost."""
 ROOM = 0.6
 """What a robot needs behind a first way-point to start there [m]: half its length, and up to 0.2 m (section 5.7)."""
 WALL_HEIGHT = 0.72
@@ -155,14 +157,14 @@ class Course:
                 )
             for first, second in pairwise(route):
                 for leaving, coming in self._pairs(first, second):
-                    gap = math.dist(
-                        _world(self.slots[first], leaving.goals[-1]), _world(self.slots[second], coming.goals[0])
-                    )
-                    if gap > LONGEST_WAY:
+                    ends = (self.slots[first], leaving.goals[-1]), (self.slots[second], coming.goals[0])
+                    gap = math.dist(*(_world(slot, goal) for slot, goal in ends))
+                    if gap > LONGEST_WAY or gap + _farther(*ends) > FARTHEST:
                         raise CourseError(
                             f"course {self.name!r}: the way from slot {first} ({leaving.obstacle}) to slot {second} "
-                            f"({coming.obstacle}) is {gap:.2f} m, expected at most {LONGEST_WAY} m between "
-                            "way-points; move the slots together or add way-points"
+                            f"({coming.obstacle}) is {gap:.2f} m and {gap + _farther(*ends):.2f} m with jitter, "
+                            f"expected at most {LONGEST_WAY} m and {FARTHEST} m between way-points; move the slots "
+                            "together or add way-points"
                         )
 
     def _check_places(self) -> None:
@@ -207,6 +209,12 @@ def _world(slot: Slot, point: tuple[float, float]) -> tuple[float, float]:
     )
 
 
+def _farther(*ends: tuple[Slot, tuple[float, float]]) -> float:
+    """By how much jitter may move two way-points, each of a slot, apart at most [m]."""
+    shift = math.hypot(sum(slot.jitter.x for slot, _ in ends), sum(slot.jitter.y for slot, _ in ends))
+    return shift + sum(2.0 * math.hypot(*goal) * math.sin(min(slot.jitter.yaw, math.pi) / 2.0) for slot, goal in ends)
+
+
 def _check_slot(slot: Slot, where: str) -> None:
     if slot.obstacle not in OBSTACLES:
         raise CourseError(f"{where}: unknown obstacle; expected one of {', '.join(OBSTACLES)}")
@@ -232,7 +240,7 @@ def _check_slot(slot: Slot, where: str) -> None:
 
 
 def _overlap(slot: Slot, kind: Obstacle, other: Slot, other_kind: Obstacle) -> bool:
-    """Whether two footprints share a point: no axis of either separates them."""
+    """Whether two footprints share a point, jitter left aside (the released course's may): no axis separates them."""
     between = (other.position[0] - slot.position[0], other.position[1] - slot.position[1])
     for angle in (slot.yaw, slot.yaw + math.pi / 2, other.yaw, other.yaw + math.pi / 2):
         axis = (math.cos(angle), math.sin(angle))

@@ -68,7 +68,7 @@ class PPOUpdate:
         schedule: adapts the learning rate to that divergence.
         precision: ``torch.bfloat16`` runs the hidden layers of policy and critic in it, about twice as fast where the
             processor multiplies in it; weights, the outputs and all that follows stay float32.
-        compile: fuse the loss by ``torch.compile``, which takes about a minute at the first minibatch and needs a C++
+        compile: fuse the loss by ``torch.compile``, which takes half a minute at the first minibatch and needs a C++
             compiler on a CPU; numbers differ by rounding.
 
     Raises:

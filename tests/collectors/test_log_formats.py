@@ -129,6 +129,33 @@ def test_damaged_files(tmp_path: Path, suffix: str) -> None:
         read_columns(path)
 
 
+@pytest.mark.parametrize("name", ["joint_names", "time", "quaternion"])
+def test_npz_whose_arrays_have_no_rows(tmp_path: Path, name: str) -> None:
+    path = write_columns(tmp_path / "log.npz", columns())
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **{**arrays, name: arrays[name][0]})
+    with pytest.raises(RobotLogError, match=f"{name} must have a row for each"):
+        read_columns(path)
+
+
+def test_what_only_looks_like_a_log(tmp_path: Path) -> None:
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    (tmp_path / "array.npy").rename(tmp_path / "array.npz")
+    with pytest.raises(RobotLogError, match="damaged or no npz"):
+        read_columns(tmp_path / "array.npz")
+    np.savez_compressed(tmp_path / "bad.npz", time=np.arange(4000.0))
+    content = bytearray((tmp_path / "bad.npz").read_bytes())
+    content[100:140] = bytes(40)
+    (tmp_path / "bad.npz").write_bytes(content)
+    with pytest.raises(RobotLogError, match="damaged or no npz"):
+        read_columns(tmp_path / "bad.npz")
+    text = write_columns(tmp_path / "log.csv", columns(400)).read_text()
+    (tmp_path / "log.csv").write_text(text.replace("\n", '\n"', 1))
+    with pytest.raises(RobotLogError, match=r"is no CSV file: .*look for a stray quotation mark"):
+        read_columns(tmp_path / "log.csv")
+
+
 def test_npz_without_numbers_or_with_pickled_objects(tmp_path: Path) -> None:
     path, names = tmp_path / "log.npz", np.array(constants.JOINT_NAMES)
     np.savez(path, joint_names=names, time=np.array(["a", "b"]))

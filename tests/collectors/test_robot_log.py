@@ -127,6 +127,13 @@ def test_numbers_that_cannot_be(name: str, row: int, column: int, value: float, 
     assert message in refused(with_value(name, row, column, value))
 
 
+@pytest.mark.parametrize("value", [math.nan, 0.5, -1.0])
+def test_a_start_is_one_or_none(value: float) -> None:
+    start = torch.zeros(150)
+    start[7] = value
+    assert f"row 7, start: expected 0 or 1, got {value:g}" in refused(columns(start=start))
+
+
 def test_nan_in_time() -> None:
     time = columns()["time"]
     time[9] = math.nan

@@ -80,6 +80,18 @@ def test_a_bad_course_is_refused(changes: dict[str, object], message: str) -> No
         replace(COURSE, **changes)  # type: ignore[arg-type]
 
 
+def test_a_way_must_not_be_too_long_wherever_jitter_moves_its_ends() -> None:
+    """Way-points 0.9 m behind the first bar and 1.8 m before the second, which lie on one line."""
+    first, second = Slot("bar_jump", (3.0, 5.0)), Slot("bar_jump", (3.0 + 0.9 + 3.0 + 1.8, 5.0))
+    assert Course("long", (12.0, 10.0), (first, second))
+    for jitter, most in ((Jitter(0.2, 0.1), math.hypot(0.4, 0.2)), (Jitter(0.0, 0.0, 0.2), 2.0 * 2.7 * math.sin(0.1))):
+        slots = tuple(replace(slot, jitter=jitter) for slot in (first, second))
+        assert Course("long", (12.0, 10.0), slots)
+        slots = (slots[0], replace(slots[1], position=(slots[1].position[0] + 0.5, 5.0)))
+        with pytest.raises(CourseError, match=rf"is 3\.50 m and {3.5 + most:.2f} m with jitter, expected"):
+            Course("long", (12.0, 10.0), slots)
+
+
 def test_shuffled_obstacles_must_fit_in_every_slot() -> None:
     slots = (Slot("tunnel", (1.2, 3.0), math.pi / 2), Slot("bar_jump", (1.2, 7.0), math.pi / 2))
     assert Course("narrow", (4.0, 10.0), slots)

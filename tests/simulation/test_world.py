@@ -34,9 +34,7 @@ def test_hinges_and_ground_of_the_scenery_are_found() -> None:
 
 def test_robots_start_two_metres_from_the_edge_of_a_height_field() -> None:
     assert World(terrain=HeightField(torch.zeros(4, 4), (6.0, 9.0))).ground_extent == 4.0
-    with pytest.raises(
-        ValueError, match=r"must reach farther than 2\.0 m from its middle, got half sides of \(2"
-    ):
+    with pytest.raises(ValueError, match=r"must reach farther than 2\.0 m from its middle, got half sides of \(2"):
         World(terrain=HeightField(torch.zeros(4, 4), (2.0, 9.0)))
     assert World().ground_extent == 0.0
 
