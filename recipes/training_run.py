@@ -218,12 +218,10 @@ def run(
         The run folder.
 
     Raises:
-        ValueError: if there is no iteration, or no checkpoint.
+        ValueError: if it would never be saved.
     """
-    if cfg.iterations < 1 or cfg.checkpoint_every < 1:
-        raise ValueError(
-            f"expected --iterations and --checkpoint-every of at least 1, got {cfg.iterations}, {cfg.checkpoint_every}"
-        )
+    if cfg.checkpoint_every < 1:
+        raise ValueError(f"--checkpoint-every: expected at least 1, got {cfg.checkpoint_every}")
     with distributed.processes(cuda=simulator_device(cfg.simulator, cfg.device).type == "cuda"):
         return _run(recipe, cfg, build(cfg), begin, iterate, save_policy, headline)
 

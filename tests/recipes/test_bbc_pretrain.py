@@ -212,7 +212,7 @@ def test_a_killed_run_goes_on(tmp_path: Path, moment: str) -> None:
         (("--iterations", "0"), "--iterations: expected at least 1, got 0"),
         (("--motion.label-share", "0"), "expected --imitation.conditional, --imitation.labelled-share"),
         (("--resume", "nowhere"), "nothing to resume"),
-        (("--checkpoint-every", "0"), "expected --iterations and --checkpoint-every of at least 1, got 2, 0"),
+        (("--checkpoint-every", "0"), "--checkpoint-every: expected at least 1, got 0"),
         (("--ppo.minibatches", "0"), "expected epochs and minibatches of at least 1, got 1 and 0"),
         (("--ppo.steps", "0"), "num_steps must be at least 1, got 0"),
     ],
