@@ -193,12 +193,11 @@ def _read_npz(path: Path) -> dict[str, Any]:
         raise RobotLogError(f"{path} is damaged or no npz file: {reason}") from error
     if "joint_names" not in arrays:
         raise RobotLogError(f"{path} has no joint_names; without them the order of its joints cannot be checked")
-    for name, value in arrays.items():
-        if value.ndim < (2 if name in GROUPS else 1):
-            raise RobotLogError(f"{path}: {name} must have a row for each control step, got the shape {value.shape}")
-    check_names(f"{path}: joint_names", [str(name) for name in arrays["joint_names"]], constants.JOINT_NAMES)
+    check_names(f"{path}: joint_names", [str(name) for name in arrays["joint_names"].flat], constants.JOINT_NAMES)
     known = {name: value for name, value in arrays.items() if name in GROUPS or name in ("time", "start")}
     for name, value in known.items():
+        if value.ndim < (2 if name in GROUPS else 1):
+            raise RobotLogError(f"{path}: {name} must have a row for each control step, got the shape {value.shape}")
         if not np.issubdtype(value.dtype, np.number) and value.dtype != np.bool_:
             raise RobotLogError(f"{path}: {name} must hold numbers, got {value.dtype}")
     return known

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
+from weakref import WeakSet
 
 import mujoco
 import numpy as np
@@ -90,7 +91,7 @@ class BatchSimulator:
             self.world, num_simulations, lambda field: torch.from_numpy(self.batch.expand(field))
         )
         self._previous_target = torch.tensor(constants.DEFAULT_POSE).repeat(num_simulations, 1)
-        self._cameras: list[DepthCamera] = []
+        self._cameras: WeakSet[DepthCamera] = WeakSet()
         self.unstable = torch.zeros(num_simulations, dtype=torch.bool)
         self._qpos[:, JOINTS] = self._ctrl[:] = constants.DEFAULT_POSE
         self.batch.forward()
@@ -238,8 +239,9 @@ class BatchSimulator:
 
     def make_camera(self) -> DepthCamera:
         """A depth camera on every robot, which follows these simulations."""
-        self._cameras.append(DepthCamera(self.world.spec, self.batch, self.num_threads))
-        return self._cameras[-1]
+        camera = DepthCamera(self.world.spec, self.batch, self.num_threads)
+        self._cameras.add(camera)
+        return camera
 
     def state_dict(self) -> dict[str, Any]:
         """Everything an exact continuation needs: integration states, parameters, derived fields last read."""

@@ -129,13 +129,22 @@ def test_damaged_files(tmp_path: Path, suffix: str) -> None:
         read_columns(path)
 
 
-@pytest.mark.parametrize("name", ["joint_names", "time", "quaternion"])
-def test_npz_whose_arrays_have_no_rows(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("joint_names", "joint_names lacks 'FL_thigh_joint'; it has 1 columns, expected 12"),
+        ("time", "time must have a row for each control step"),
+        ("quaternion", "quaternion must have a row for each control step"),
+    ],
+)
+def test_npz_whose_arrays_have_no_rows(tmp_path: Path, name: str, message: str) -> None:
     path = write_columns(tmp_path / "log.npz", columns())
     with np.load(path) as file:
         arrays = dict(file)
+    np.savez(path, **{**arrays, "robot": np.array(7)})
+    assert "robot" not in read_columns(path), "what is foreign may have any shape"
     np.savez(path, **{**arrays, name: arrays[name][0]})
-    with pytest.raises(RobotLogError, match=f"{name} must have a row for each"):
+    with pytest.raises(RobotLogError, match=message):
         read_columns(path)
 
 
