@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 import time
@@ -27,6 +28,7 @@ from agility_rl.deploy.loopback import (
 from agility_rl.deploy.robot_process import RobotServer, in_real_time
 from agility_rl.deploy.simulated import SimulatedRobot
 from agility_rl.deploy.transport import JointCommand, RobotState
+from tests.waiting import until
 
 
 def random_state(generator: torch.Generator) -> RobotState:
@@ -79,24 +81,28 @@ def test_commanders_are_forgotten() -> None:
 
 
 def test_who_has_fallen_silent_does_not_take_itself_for_alone() -> None:
-    server = RobotServer(SimulatedRobot())
-    stop = threading.Event()
-    thread = threading.Thread(target=in_real_time, args=(server,), kwargs={"stopped": stop.is_set})
-    thread.start()
-    driving, silent = LoopbackTransport(server.port), LoopbackTransport(server.port)
-    silent.send(JointCommand.damped(0.0))
-    end = time.monotonic() + 1.0
-    while time.monotonic() < end:
-        driving.send(JointCommand.damped(0.0))
-        time.sleep(0.01)
-        silent.read()
-    assert silent.other_commanders() == ("1 other program",)
-    driving.read()
-    assert driving.other_commanders() == ()
-    stop.set()
-    thread.join()
-    for end_of_line in (driving, silent, server):
-        end_of_line.close()
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(contextlib.closing(RobotServer(SimulatedRobot())))
+        stop = threading.Event()
+        thread = threading.Thread(target=in_real_time, args=(server,), kwargs={"stopped": stop.is_set})
+        thread.start()
+        stack.callback(thread.join)
+        stack.callback(stop.set)
+        driving, silent = (
+            stack.enter_context(contextlib.closing(LoopbackTransport(server.port, patience=60.0))) for _ in range(2)
+        )
+        silent.send(JointCommand.damped(0.0))
+
+        def heard() -> int:
+            """How many programs command, as the robot tells; one of them goes on."""
+            driving.send(JointCommand.damped(0.0))
+            silent.read()
+            driving.read()
+            return driving._commanders
+
+        assert until(lambda: heard() == 2)
+        assert until(lambda: heard() == 1 and silent._commanders == 1 and driving.other_commanders() == ())
+        assert silent.other_commanders() == ("1 other program",)
 
 
 def test_a_missing_robot_is_named() -> None:
