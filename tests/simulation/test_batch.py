@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -250,6 +251,7 @@ def test_state_of_the_other_simulator_is_refused() -> None:
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="counts threads as Linux does")
 def test_closing_releases_the_batch() -> None:
+    gc.collect()
     before = len(os.listdir("/proc/self/task"))
     simulator = BatchSimulator(4, num_threads=3)
     camera = simulator.make_camera()
@@ -258,4 +260,4 @@ def test_closing_releases_the_batch() -> None:
     assert len(os.listdir("/proc/self/task")) > before
     simulator.close()
     simulator.close()
-    assert not hasattr(simulator, "batch") and len(os.listdir("/proc/self/task")) == before
+    assert not hasattr(simulator, "batch") and len(os.listdir("/proc/self/task")) <= before
