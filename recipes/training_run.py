@@ -120,7 +120,9 @@ def check_began_with(run: Path | None, kind: str, digest: str, path: Path) -> No
         ArtifactError: if they are others.
     """
     if run is not None and (run / "policy" / MANIFEST_FILE).is_file():
-        began = json.loads((run / "policy" / MANIFEST_FILE).read_text(encoding="utf-8")).get(kind, digest)
+        began = json.loads((run / "policy" / MANIFEST_FILE).read_text(encoding="utf-8")).get(kind)
+        if began is None:
+            raise ArtifactError(f"{run} does not say which policy it began with ({kind}); begin another one: --init-from")
         if began != digest:
             raise ArtifactError(
                 f"{run} began with another policy ({kind} {began[:12]}) than {path} holds now ({digest[:12]}); put it "
