@@ -224,7 +224,8 @@ class DDSTransport:
         self._feet = unitree.FootCalibration() if feet is None else feet
         self._others, self._stop_pressed = Commanders(), False
         self._state: RobotState | None = None
-        self._robot, self._checksum = 0, 0
+        self._robot: int | None = None
+        self._checksum: int | None = None
         self._strangers = Commanders()
         self._arrived = time.monotonic()
         self._listen()
@@ -253,11 +254,13 @@ class DDSTransport:
         arrived = self._arrived  # before it is taken, so that a state never seems younger than it is
         for message in self._line.take(unitree.STATE_TOPIC):
             robot = message.sample_info.publication_handle
-            if self._state is not None and robot != self._robot:
+            if self._robot is None:
+                self._robot = robot
+            if robot != self._robot:
                 self._strangers.heard(robot, time.monotonic())
-            elif self._state is None or message.crc != self._checksum:
+            elif message.crc != self._checksum:
+                self._checksum = message.crc
                 self._state = unitree.from_low_state(message, arrived, self._feet)
-                self._robot, self._checksum = robot, message.crc
                 self._stop_pressed = unitree.stop_is_pressed(message.wireless_remote)
         return self._state
 
