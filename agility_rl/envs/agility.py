@@ -92,7 +92,8 @@ class AgilityEnv(MaskedResets):
         seed: seed of all randomness in the environment.
 
     Raises:
-        ValueError: if the simulator holds another number of robots or other scenery, or a number is impossible.
+        ValueError: if the simulator holds another number of robots or other scenery, a number is impossible, or there
+            is no reward term or no termination.
 
     Example:
         >>> def stand(td):
@@ -153,7 +154,10 @@ class AgilityEnv(MaskedResets):
         self.decision_steps = decision_steps
         self.rewards, self.terminations = dict(rewards), dict(terminations)
         if not self.rewards or not self.terminations:
-            raise ValueError("expected at least one reward term and one termination, got none")
+            raise ValueError(
+                "expected at least one reward term and one termination, got "
+                f"{len(self.rewards)} and {len(self.terminations)}"
+            )
         self.termination_reward = termination_reward
         self.randomization = randomization
         self.max_steps = round(episode_length / self.dt)

@@ -50,9 +50,8 @@ class LocomotionVectorEnv(VectorEnv):
         num_envs: N.
         groups: observation groups to show, entries of the ``Dict`` space; shapes and units in :mod:`agility_rl.keys`.
         autoreset_mode: one of ``AutoresetMode``, or its value, ``"NextStep"``, ``"SameStep"``, ``"Disabled"``.
-        action_limit: bounds of the action space in action units; 10 reaches every joint limit but
-            the upper ones of the thighs. Larger actions are
-            clipped.
+        action_limit: bounds of the action space in action units; 10 reaches every joint limit but the upper ones of the
+            thighs. Larger actions are clipped.
         env: ready environment, or ``None`` for one built with ``options``.
         **options: keyword arguments of :class:`LocomotionEnv`.
 

@@ -72,7 +72,8 @@ class LocomotionEnv(MaskedResets):
     Raises:
         ValueError: if the simulator holds another number of robots or, with encounters, another world, a reference
             entry is missing or too short, a behaviour has no reference state, ``standing_starts`` is no share, the
-            offsets do not rise from zero, or commands shall be redrawn more often than at every control step.
+            offsets do not rise from zero, commands or pushes shall come more often than at every control step, or there
+            is no reward term or no termination.
 
     Example:
         >>> env = LocomotionEnv(2, simulator_options={"num_threads": 1})
@@ -118,7 +119,10 @@ class LocomotionEnv(MaskedResets):
         self.rewards = dict(rewards)
         self.terminations = tuple(terminations)
         if not self.rewards or not self.terminations:
-            raise ValueError("expected at least one reward term and one termination, got none")
+            raise ValueError(
+                "expected at least one reward term and one termination, got "
+                f"{len(self.rewards)} and {len(self.terminations)}"
+            )
         self.randomization = randomization
         self.max_steps = round(episode_length / self.dt)
         self.generator = torch.Generator(device).manual_seed(seed)

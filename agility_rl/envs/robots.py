@@ -183,7 +183,7 @@ class Pushes:
 
     def __init__(self, num_robots: int, generator: torch.Generator, interval: int | None, velocity: float) -> None:
         if interval is not None and interval < 1:
-            raise ValueError("push_interval must be at least a control step, or None for no pushes")
+            raise ValueError(f"push_interval must be at least a control step, or None for none; got {interval} steps")
         self.generator, self.interval, self.velocity = generator, interval, velocity
         self.phase = torch.zeros(num_robots, dtype=torch.int64, device=generator.device)
 

@@ -258,9 +258,9 @@ def test_set_commands_holds_until_told_otherwise(build: Build) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"push_interval": 0.0}, "push_interval must be at least a control step, or None for no pushes"),
-        ({"rewards": {}}, "at least one reward term and one termination"),
-        ({"terminations": ()}, "at least one reward term and one termination"),
+        ({"push_interval": 0.0}, "push_interval must be at least a control step, or None for none; got 0 steps"),
+        ({"rewards": {}}, "at least one reward term and one termination, got 0 and"),
+        ({"terminations": ()}, "at least one reward term and one termination, got .* and 0"),
     ],
 )
 def test_what_cannot_be_an_environment_is_refused(build: Build, options: dict, message: str) -> None:
