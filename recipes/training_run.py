@@ -122,7 +122,9 @@ def check_began_with(run: Path | None, kind: str, digest: str, path: Path) -> No
     if run is not None and (run / "policy" / MANIFEST_FILE).is_file():
         began = json.loads((run / "policy" / MANIFEST_FILE).read_text(encoding="utf-8")).get(kind)
         if began is None:
-            raise ArtifactError(f"{run} does not say which policy it began with ({kind}); begin another one: --init-from")
+            raise ArtifactError(
+                f"{run} does not say which policy it began with ({kind}); begin another one: --init-from"
+            )
         if began != digest:
             raise ArtifactError(
                 f"{run} began with another policy ({kind} {began[:12]}) than {path} holds now ({digest[:12]}); put it "
@@ -291,7 +293,8 @@ def _run(
     save()
     if logger is not None:
         logger.close()
-        left = f" after {progress['iteration']:.0f} of {cfg.iterations} iterations" + ", by --max-minutes" * late
-        print(f"saved {folder}" + left * (progress["iteration"] < cfg.iterations))
+        reason = ", by --max-minutes" if late else ""
+        short = f" after {progress['iteration']:.0f} of {cfg.iterations} iterations{reason}"
+        print(f"saved {folder}" + (short if progress["iteration"] < cfg.iterations else ""))
     parts.env.close()
     return folder
