@@ -47,6 +47,15 @@ def env_of(module: Module, decider: Any, **options: Any) -> AgilityEnv:
     return AgilityEnv(3, module("tsc_setup").frozen(decider.controller), COURSES["bar_jump"], **options)
 
 
+def test_a_student_knows_where_obstacles_stand_on_its_own_course(perfect: Any) -> None:
+    assert perfect.knows(COURSES["bar_jump"]) and perfect.knows(COURSES["box"]), "there is only one to find"
+    assert not perfect.knows(COURSES["full"])
+    perfect.student.settings["routes"] = [[list(leg) for leg in route] for route in COURSES["full"].legs]
+    assert perfect.knows(COURSES["full"]) and not perfect.knows(COURSES["hurdles"])
+    perfect.student.settings["routes"] = None
+    assert perfect.knows(COURSES["hurdles"]), "who knows no places is not lost by them"
+
+
 def test_an_evaluated_student_does_what_it_would_in_an_environment_with_a_camera(
     module: Module, disturbances: ModuleType, perfect: Any
 ) -> None:
