@@ -12,6 +12,7 @@ from agility_rl.go2 import camera, constants
 from agility_rl.modules.distance_field import DistanceField, Solid
 from agility_rl.modules.glance import NUM_POSE, NUM_SCALES
 from agility_rl.modules.planar import attitude, inverted, moved, planar_motion, seen_from
+from agility_rl.modules.sigma_filter import smoothed
 
 NUM_MATCH = NUM_POSE + NUM_SCALES
 """Numbers of a match: where the obstacle is seen, and the variances of that."""
@@ -234,7 +235,7 @@ class ScanMatcher(nn.Module):
         window = self.around if slot is None else self.about_slot
         height, yaw = estimate[:, 0], torch.atan2(robot[:, 2], robot[:, 3])
         start = torch.stack((robot[:, 0], robot[:, 1], height, yaw, pitch, roll, torch.zeros_like(roll)), -1)
-        metres = camera.metres(depth).flatten(1)
+        metres = smoothed(camera.metres(depth)).flatten(1)
         points = metres[..., None] * self.rays + self.mount
         up = torch.stack((-pitch.sin(), pitch.cos() * roll.sin(), pitch.cos() * roll.cos()), -1)
         above = (points @ up[..., None])[..., 0] + height[:, None]
