@@ -101,6 +101,9 @@ TERMINATIONS = "terminations"
 DEPTH = "depth"
 """float32 ``[*B, 58, 87]``, normalised depth image in [-0.5, 0.5], near is small; stored as uint8 or int16 too."""
 
+IMAGE_AGE = "image_age"
+"""float32 ``[*B, 1]``, how long ago the depth image was taken [s]."""
+
 DEPTH_FEATURE = "depth_feature"
 """float32 ``[*B, 32]``, what the depth encoder makes of one image."""
 

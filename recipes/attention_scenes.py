@@ -113,6 +113,7 @@ def collect_scenes(
             raise ValueError(f"only {count} of {wanted} moments show an obstacle; lower --least or --images")
         seen, mask = obstacle_pixels(env, eye)
         images = camera.normalize_depth(seen)
+        td[keys.IMAGE_AGE] = torch.zeros(robots, 1)
         contexts, decisions = [], []
         for index, (decider, student) in enumerate(zip(deciders, students, strict=True)):
             read = [key for key in student.policy().in_keys if key not in (keys.DEPTH, keys.HIDDEN, "is_init")]

@@ -68,7 +68,7 @@ class Senses:
 
     def observe(self, td: TensorDictBase, rows: Tensor) -> TensorDictBase:
         """Add to observations of the M rows of a bool mask what the student reads besides."""
-        td[keys.DEPTH] = self.disturb(self.eyes.image()[rows])
+        td[keys.DEPTH], td[keys.IMAGE_AGE] = self.disturb(self.eyes.image()[rows]), self.eyes.age()[rows]
         td[keys.HIDDEN], td["is_init"] = self.hidden[rows], self.is_init[rows]
         return td
 

@@ -6,6 +6,7 @@ import math
 
 import torch
 
+from agility_rl.go2.camera import LATENCY
 from agility_rl.modules.placed_memory import PlacedMemory
 
 POINTS = torch.tensor([-1.5, -0.5, 0.5, 1.5])[:, None] * torch.tensor([1.0, 0.0]).expand(7, 1, 2)
@@ -39,7 +40,13 @@ def still(memory: PlacedMemory, pose: list[float], at: int | None = None) -> tup
         belief = belief - 30.0
         belief[at] = 0.0
     before = torch.cat((torch.tensor(pose) - memory.starts[0], torch.zeros(3), belief - memory.prior))
-    seen = torch.zeros(1, 32), torch.zeros(1, 45), torch.zeros(1, 4), torch.zeros(1, 58, 87)
+    seen = (
+        torch.zeros(1, 32),
+        torch.zeros(1, 45),
+        torch.zeros(1, 4),
+        torch.zeros(1, 58, 87),
+        torch.full((1, 1), LATENCY),
+    )
     return *seen, torch.cat((torch.zeros(8), before, torch.zeros(sum(memory.parts[4:]))))[None]
 
 

@@ -160,9 +160,22 @@ class DAggerCollector:
         return {} if self._carrier is None else {"carrier": self._carrier.clone().to_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
+        """Restore what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if student or teacher read what was not observed then.
+        """
         carrier = state.get("carrier")
-        self._carrier = None if carrier is None else TensorDict(carrier, self.env.batch_size)
+        if carrier is not None:
+            carrier = TensorDict(carrier, self.env.batch_size)
+            if missing := [
+                key for key in (*self.student.in_keys, *self.teacher.in_keys) if key not in carrier.keys(True)
+            ]:
+                raise ValueError(
+                    f"the observations to go on from lack {missing}: another release wrote them; begin a new run that "
+                    "starts from the student of this one"
+                )
+        self._carrier = carrier
 
 
 def _decision(action: TensorDictBase | Tensor) -> TensorDictBase | Tensor:

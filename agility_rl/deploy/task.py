@@ -20,11 +20,11 @@ from agility_rl.modules import RecurrentStudent
 from agility_rl.modules.placed_memory import memory_parts
 from agility_rl.modules.student import PERCEIVED_HEADING, PERCEIVED_OBSTACLE, PERCEIVED_PLACE
 
-StudentNet = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
-"""Depth [1, 58, 87], proprioception [1, 45], history [1, 10, 45] and memory [1, H] to logits [1, 5], parameters
-[1, 5, 6], heading errors [1, 2], obstacle logits [1, K] and the memory of the next step [1, H]."""
+StudentNet = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
+"""Depth [1, 58, 87], its age [1, 1] in s, proprioception [1, 45], history [1, 10, 45] and memory [1, H] to logits
+[1, 5], parameters [1, 5, 6], heading errors [1, 2], obstacle logits [1, K] and the memory of the next step [1, H]."""
 
-INPUTS = (keys.DEPTH, keys.PROPRIOCEPTION, keys.HISTORY, keys.HIDDEN)
+INPUTS = (keys.DEPTH, keys.IMAGE_AGE, keys.PROPRIOCEPTION, keys.HISTORY, keys.HIDDEN)
 OUTPUTS = ("logits", "parameters", "heading", "obstacle", "memory")
 
 
@@ -42,7 +42,7 @@ class StudentNetwork(nn.Module):
     Example:
         >>> student = RecurrentStudent(memory=16, hidden=(8,))
         >>> network = StudentNetwork(student)
-        >>> outputs = network(torch.zeros(1, 58, 87), torch.zeros(1, 45), torch.zeros(1, 10, 45), torch.zeros(1, 16))
+        >>> outputs = network(*example_inputs(16))
         >>> [tuple(output.shape) for output in outputs]
         [(1, 5), (1, 5, 6), (1, 2), (1, 7), (1, 16)]
     """
@@ -58,10 +58,10 @@ class StudentNetwork(nn.Module):
         self.estimated = list(student.estimator.in_keys)
 
     def forward(
-        self, depth: Tensor, proprioception: Tensor, history: Tensor, hidden: Tensor
+        self, depth: Tensor, age: Tensor, proprioception: Tensor, history: Tensor, hidden: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Logits, parameters, heading errors [rad], obstacle logits, memory."""
-        known = {keys.DEPTH: depth, keys.PROPRIOCEPTION: proprioception, keys.HISTORY: history}
+        known = dict(zip(INPUTS, (depth, age, proprioception, history), strict=False))
         known[keys.ESTIMATE] = self.estimator(*(known[name] for name in self.estimated))
         latent, heading, obstacle, after, *places = self.memory.step(
             self.encoder(depth), *(known[name] for name in self.measured), hidden
@@ -161,18 +161,19 @@ class DeployedStudent:
         else:
             self._history = torch.cat((self._history[1:], present[None]))
         if self._command is None or self._count % self.steps == 0:
-            self._command = self._look(present)
+            self._command = self._look(perception)
         self._count += 1
         return self._command
 
-    def _look(self, present: Tensor) -> BehaviourCommand:
+    def _look(self, perception: Perception) -> BehaviourCommand:
         frame = self.eyes.latest()
         if frame is None:
             raise RuntimeError("the student has to decide and no depth image has arrived; is the camera running?")
         assert self._history is not None
         depth = self._preprocess(frame.image)[None]
+        age = torch.tensor([[max(0.0, perception.time - frame.time)]])
         logits, parameters, heading, obstacle, self._hidden = self.network(
-            depth, present[None], self._history[None], self._hidden
+            depth, age, perception.proprioception[None], self._history[None], self._hidden
         )
         self.heading, self.obstacle = heading[0], int(obstacle[0].argmax())
         skill = logits.argmax(-1)
@@ -207,11 +208,12 @@ def fastest_canter(artifact: Artifact) -> float:
     return float(said)
 
 
-def example_inputs(memory: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def example_inputs(memory: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Zeros in the shapes that the network of a student with so large a memory takes."""
     size = features.NUM_PROPRIOCEPTION
     image = torch.zeros(1, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)
-    return image, torch.zeros(1, size), torch.zeros(1, features.HISTORY, size), torch.zeros(1, memory)
+    history = torch.zeros(1, features.HISTORY, size)
+    return image, torch.zeros(1, 1), torch.zeros(1, size), history, torch.zeros(1, memory)
 
 
 def torch_student(artifact: Artifact) -> StudentNetwork:

@@ -178,7 +178,7 @@ class AgilityEnv(MaskedResets):
         def group(*shape: int) -> Unbounded:
             return Unbounded((n, *shape), dtype=torch.float32)
 
-        image = (n, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)
+        images = Bounded(-0.5, 0.5, (n, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH), dtype=torch.float32)
         skill = Categorical(behaviours.NUM_BEHAVIOURS, shape=(n,), dtype=torch.int64)
         self.observation_spec = Composite(
             {
@@ -197,7 +197,7 @@ class AgilityEnv(MaskedResets):
                 keys.PROGRESS: group(self.arena.progress.num_stages),
                 keys.SCANDOTS: group(NUM_SCANDOTS),
                 **outcome_specs(n, (*self.rewards, TERMINATION_TERM), self.terminations),
-                **({} if self.depth is None else {keys.DEPTH: Bounded(-0.5, 0.5, image, dtype=torch.float32)}),
+                **({} if self.depth is None else {keys.DEPTH: images, keys.IMAGE_AGE: group(1)}),
             },
             shape=(n,),
         )
@@ -337,7 +337,7 @@ class AgilityEnv(MaskedResets):
         observation = self.observations.build(self._robot, self.decisions.commands, self.robots.privileged)
         observation.update(self.arena.observe(self.simulator, self._robot.yaw))
         if self.depth is not None:
-            observation[keys.DEPTH] = self.depth.image()
+            observation[keys.DEPTH], observation[keys.IMAGE_AGE] = self.depth.image(), self.depth.age()
         return observation.update(outcome.entries(self.arena.progress.detour))
 
     # -- resume ------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from agility_rl.envs.randomization import uniform
 from agility_rl.go2 import camera
+from agility_rl.go2.constants import CONTROL_DT
 from agility_rl.simulation import Simulator
 from agility_rl.tensors import rows_of
 
@@ -106,9 +107,18 @@ class DepthObservation:
 
     def image(self) -> Tensor:
         """What the robots see, normalised, ``[N, 58, 87]``."""
-        old_enough = self._taken <= (self._step - self._late)[:, None]
-        index = old_enough.sum(-1).clamp(min=1) - 1  # frames are ordered by age
+        index = self._shown()
         return self._frames[torch.arange(len(index), device=index.device), index]
+
+    def age(self) -> Tensor:
+        """How long ago that was taken, ``[N, 1]`` [s]; an episode's first frame, as if the robot had stood before."""
+        taken = self._taken.gather(1, self._shown()[:, None])[:, 0].clamp(min=0)
+        return (CONTROL_DT * torch.maximum(self._step - taken, self._late))[:, None]
+
+    def _shown(self) -> Tensor:
+        """Index of the frame that robots see, ``[N]``."""
+        old_enough = self._taken <= (self._step - self._late)[:, None]
+        return old_enough.sum(-1).clamp(min=1) - 1  # frames are ordered by age
 
     def _take(self, mask: Tensor) -> Tensor:
         """Normalised frames ``[M, 58, 87]`` of :func:`~agility_rl.tensors.rows_of` a bool mask."""

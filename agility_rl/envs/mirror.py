@@ -57,6 +57,7 @@ _IMAGES: dict[NestedKey, Callable[[Tensor], Tensor]] = {
     keys.OBSTACLE: _same,
     keys.SCANDOTS: _scandots,
     keys.DEPTH: _image,
+    keys.IMAGE_AGE: _same,
     keys.ACTION: mirror_joints,
     (keys.ACTION, keys.BEHAVIOUR): _same,
     (keys.ACTION, keys.PARAMETERS): mirror_commands,

@@ -15,6 +15,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from agility_rl.go2 import constants
+
 SENSOR_WIDTH, SENSOR_HEIGHT = 848, 480
 """Pixels of the camera's own image. [S]"""
 
@@ -42,6 +44,9 @@ POSITION = (0.305, 0.0175, 0.098)
 
 PITCH_JITTER = math.radians(5.0)
 """The mounting angle is drawn from +- this [rad]; positive looks down. [5.8]"""
+
+LATENCY = constants.CONTROL_DT
+"""Age of an image when a student decides by it [s]: one frame at 50 Hz. [5.8]"""
 
 DEPTH_NEAR, DEPTH_FAR = 0.3, 4.0
 """Depths are clipped to this range [m]. [5.8]"""

@@ -57,8 +57,18 @@ class Glance(nn.Module):
         out: Tensor = self.linear(feature)
         return out
 
-    def where(self, feature: Tensor, expected: Tensor, leg: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the obstacle of a leg, int64 ``[*B]``, is seen, ``[*B, 4]``, and logarithms of scales, ``[*B, 3]``."""
-        known = torch.cat((feature, expected, nn.functional.one_hot(leg, self.legs).to(feature.dtype)), -1)
+    def where(
+        self, feature: Tensor, expected: Tensor, leg: Tensor, then: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Where the obstacle of a leg, int64 ``[*B]``, is seen, ``[*B, 4]``, and logarithms of scales, ``[*B, 3]``.
+
+        Args:
+            feature: of the images, ``[*B, F]``.
+            expected: where it is expected, ``[*B, 4]``.
+            leg: which obstacle of the course.
+            then: where it was expected when the image was taken, if that is longer ago than in training.
+        """
+        shown = expected if then is None else then
+        known = torch.cat((feature, shown, nn.functional.one_hot(leg, self.legs).to(feature.dtype)), -1)
         correction, scale = self.correction(known).split((NUM_POSE, NUM_SCALES), -1)
         return expected + correction, scale.clamp(*SCALES)

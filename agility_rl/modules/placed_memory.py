@@ -7,11 +7,21 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from agility_rl.go2.camera import LATENCY
 from agility_rl.modules.distance_field import Solid
 from agility_rl.modules.glance import NUM_POSE, NUM_SCALES, Glance
 from agility_rl.modules.kalman import corrected, doubted
 from agility_rl.modules.mlp import mlp
-from agility_rl.modules.planar import bearings, inverse, inverted, moved, planar_motion, seen_from, within
+from agility_rl.modules.planar import (
+    bearings,
+    inverse,
+    inverted,
+    moved,
+    planar_motion,
+    seen_earlier,
+    seen_from,
+    within,
+)
 from agility_rl.modules.preview import Preview, preview_parts
 from agility_rl.modules.scan_matching import NOTHING, NUM_MATCH, ScanMatcher
 from agility_rl.modules.scandots import NUM_TERRAIN_LATENT
@@ -103,7 +113,8 @@ class PlacedMemory(nn.Module):
     Example:
         >>> memory = PlacedMemory(32, 45, 16, 7, 0.04, torch.zeros(7, 4, 2), [[(2.0, 3.0, 1.57), (2.0, 7.0, 1.57)]])
         >>> outputs = memory(torch.zeros(5, 3, 32), torch.zeros(5, 3, 45), torch.zeros(5, 3, 4),
-        ...     torch.zeros(5, 3, 58, 87), torch.zeros(5, 3, memory.size), torch.zeros(5, 3, 1, dtype=torch.bool))
+        ...     torch.zeros(5, 3, 58, 87), torch.full((5, 3, 1), 0.02), torch.zeros(5, 3, memory.size),
+        ...     torch.zeros(5, 3, 1, dtype=torch.bool))
         >>> [tuple(output.shape) for output in outputs]
         [(5, 3, 32), (5, 3, 2), (5, 3, 7), (5, 3, 66), (5, 3, 8), (5, 3, 8), (5, 3, 21)]
     """
@@ -179,6 +190,7 @@ class PlacedMemory(nn.Module):
         proprioception: Tensor,
         estimate: Tensor,
         look: Tensor,
+        age: Tensor,
         hidden: Tensor,
         is_init: Tensor,
         start: Tensor | None = None,
@@ -186,11 +198,11 @@ class PlacedMemory(nn.Module):
         """Steps of ``[T, *B]``: latent, heading errors [rad], obstacle logits, memory after, place, progress, matches.
 
         Progress are log-probabilities. ``look`` is an image ``[58, 87]``, or what came of it: the match of the present
-        obstacle, that of the next one, and what speaks for its types.
+        obstacle, that of the next one, and what speaks for its types; ``age`` is how old it is [s].
         Of ``hidden`` only the first step's counts; it begins as :meth:`begun` does.
         """
         state, steps = hidden[0], []
-        for time, measured in enumerate(zip(feature, proprioception, estimate, look, strict=True)):
+        for time, measured in enumerate(zip(feature, proprioception, estimate, look, age, strict=True)):
             state = self.begun(state, is_init[time], None if start is None else start[time])
             steps.append(self.step(*measured, state))
             state = steps[-1][3]
@@ -213,14 +225,15 @@ class PlacedMemory(nn.Module):
         )
 
     def step(
-        self, feature: Tensor, proprioception: Tensor, estimate: Tensor, look: Tensor, hidden: Tensor
+        self, feature: Tensor, proprioception: Tensor, estimate: Tensor, look: Tensor, age: Tensor, hidden: Tensor
     ) -> tuple[Tensor, ...]:
         """One step of ``[*B]``, with outputs as :meth:`forward`."""
         remembered, pose, variance, belief, coming, met = hidden.split(self.parts, -1)
         met = met.unflatten(-1, (-1, self.types))
         belief = (belief + self.prior).softmax(-1)
         variance = (variance + self.uncertain).clamp(min=0.0) + self.drift
-        motion = 0.5 * self.period * planar_motion(proprioception, estimate)
+        velocity = planar_motion(proprioception, estimate)
+        motion = 0.5 * self.period * velocity
         pose = moved(pose + self.starts[0], motion)
         at = within(pose, self.legs)  # at the obstacle of every leg
         before = belief.argmax(-1) // self.points
@@ -246,9 +259,9 @@ class PlacedMemory(nn.Module):
         logits = seems + self.preview.hints(coming)[1] + remaining(met, leg, self.stock)
         met = noted(met, leg, logits)
         likely = remaining(met, self.next_leg[leg], self.stock)
-        said, scale = self.glance.where(feature, ahead, leg)
+        said, scale = self.glance.where(feature, ahead, leg, seen_earlier(ahead, (age - LATENCY) * velocity))
         ahead, variance = corrected(ahead, variance, said, 2.0 * (2.0 * scale + alike + ALIKE).exp())
-        measured = look, proprioception, estimate
+        measured = look, proprioception, estimate, age
         match = self._match(*measured, ahead, logits.argmax(-1))
         fits, unsure = match.split((NUM_POSE, NUM_SCALES), -1)
         ahead, variance = corrected(ahead, variance, fits, doubted(ahead, variance, fits, unsure))
@@ -265,13 +278,15 @@ class PlacedMemory(nn.Module):
         said = torch.cat((match, sight), -1)
         return latent.tanh(), bearings(place), logits, torch.cat(after, -1), place, progress, said
 
-    def _match(self, look: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor, kind: Tensor) -> Tensor:
+    def _match(
+        self, look: Tensor, proprioception: Tensor, estimate: Tensor, age: Tensor, expected: Tensor, kind: Tensor
+    ) -> Tensor:
         """What the shape of an obstacle says of where it stands, ``[*B, 7]``."""
         if look.shape[-1] == self.said:
             return look[..., :NUM_MATCH]
         if self.matcher is None:
             return torch.cat((expected, torch.full_like(expected[..., :NUM_SCALES], NOTHING)), -1).detach()
-        rows = (part.reshape(-1, part.shape[-1]) for part in (proprioception, estimate, expected))
+        rows = (part.reshape(-1, part.shape[-1]) for part in (proprioception, estimate, age, expected))
         match: Tensor = self.matcher(look.reshape(-1, *look.shape[-2:]), *rows, kind.reshape(-1))
         return match.reshape(*expected.shape[:-1], NUM_MATCH)
 
@@ -280,6 +295,7 @@ class PlacedMemory(nn.Module):
         look: Tensor,
         proprioception: Tensor,
         estimate: Tensor,
+        age: Tensor,
         coming: Tensor,
         slot: Tensor,
         likely: Tensor,
@@ -291,7 +307,7 @@ class PlacedMemory(nn.Module):
         if self.matcher is None:
             return self.preview.silence(coming, slot)
         images, going = look.reshape(-1, *look.shape[-2:]), is_next.reshape(-1)
-        rows = (part.reshape(-1, part.shape[-1]) for part in (proprioception, estimate, coming, slot, likely))
+        rows = (part.reshape(-1, part.shape[-1]) for part in (proprioception, estimate, age, coming, slot, likely))
         sight = self.preview.look(self.matcher, going, images, *rows)
         return sight.reshape(*slot.shape[:-1], -1)
 

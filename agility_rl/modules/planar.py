@@ -171,8 +171,29 @@ def moved(pose: Tensor, motion: Tensor) -> Tensor:
         >>> moved(torch.tensor([-2.0, 0.0, 0.0, 1.0]), torch.tensor([0.5, 0.0, torch.pi / 2])).round(decimals=3)
         tensor([-1.5000,  0.0000,  1.0000, -0.0000])
     """
+    return composed(pose, _step(motion))
+
+
+def seen_earlier(seen: Tensor, motion: Tensor) -> Tensor:
+    """Where what a robot sees was seen before it moved.
+
+    Source: ours; a rotation and a translation of the plane.
+
+    Args:
+        seen: ``[*B, 4]``: x, y [m], sine and cosine of the yaw, in the robot's frame.
+        motion: ``[*B, 3]``: forward and to the left [m], counterclockwise [rad].
+
+    Example:
+        >>> seen_earlier(torch.tensor([2.0, 0.0, 0.0, 1.0]), torch.tensor([0.5, 0.0, 0.0]))
+        tensor([2.5000, 0.0000, 0.0000, 1.0000])
+    """
+    return composed(_step(motion), seen)
+
+
+def _step(motion: Tensor) -> Tensor:
+    """The pose ``[*B, 4]`` after a motion from the origin."""
     forward, left, turn = motion.unbind(-1)
-    return composed(pose, torch.stack((forward, left, turn.sin(), turn.cos()), -1))
+    return torch.stack((forward, left, turn.sin(), turn.cos()), -1)
 
 
 def bearings(place: Tensor) -> Tensor:

@@ -121,6 +121,7 @@ class Preview(nn.Module):
         depth: Tensor,
         proprioception: Tensor,
         estimate: Tensor,
+        age: Tensor,
         memory: Tensor,
         at_slot: Tensor,
         likely: Tensor,
@@ -133,6 +134,7 @@ class Preview(nn.Module):
             depth: as the matcher's.
             proprioception: ``[N, 45]``.
             estimate: ``[N, 4]``.
+            age: ``[N, 1]``.
             memory: ``[N, M]``.
             at_slot: the robot's place at the next slot, ``[N, 4]``.
             likely: how likely types are beforehand, logits ``[N, K]``.
@@ -143,7 +145,7 @@ class Preview(nn.Module):
         # An exported network cannot choose rows; elsewhere most are spared K fits.
         every = torch.arange(len(visible), device=visible.device)
         rows = every if torch.compiler.is_exporting() else every[visible]
-        measured = [part[rows] for part in (depth, proprioception, estimate, expected, inverted(at_slot))]
+        measured = [part[rows] for part in (depth, proprioception, estimate, age, expected, inverted(at_slot))]
         matches, share = matcher.compare(*measured)
         evidence = EVIDENCE * share
         likeliest = ((self.hints(memory)[0] + likely)[rows] + evidence).argmax(-1)

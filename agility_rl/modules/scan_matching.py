@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from agility_rl.go2 import camera, constants
+from agility_rl.go2 import camera
 from agility_rl.modules.distance_field import DistanceField, Solid
 from agility_rl.modules.glance import NUM_POSE, NUM_SCALES
 from agility_rl.modules.planar import attitude, inverted, moved, planar_motion, seen_from
@@ -16,8 +16,6 @@ from agility_rl.modules.sigma_filter import smoothed
 
 NUM_MATCH = NUM_POSE + NUM_SCALES
 """Numbers of a match: where the obstacle is seen, and the variances of that."""
-LATENCY = constants.CONTROL_DT
-"""Age of an image when it is matched [s]: one frame (method notes, section 5.8)."""
 NEAREST, FARTHEST = 0.5, 3.9
 """Depths that count [m]: what is nearer may be the robot's own leg, what is farther nothing."""
 RAISED, GROUND = 192, 64
@@ -125,7 +123,7 @@ class ScanMatcher(nn.Module):
         >>> depth = camera.normalize_depth(ground.clamp(max=1.6))[None]  # 1.6 m before the camera a block begins
         >>> still, standing = torch.zeros(1, 45), torch.tensor([[0.27, 0.0, 0.0, 0.0]])
         >>> expected = torch.tensor([[2.2, 0.0, 0.0, 1.0]])  # its middle, which is 0.1 m farther on
-        >>> match = matcher(depth, still, standing, expected, torch.tensor([0]))
+        >>> match = matcher(depth, still, standing, torch.full((1, 1), 0.02), expected, torch.tensor([0]))
         >>> round(match[0, 0].item(), 1), bool(match[0, 4] < 0.1**2)
         (2.3, True)
     """
@@ -163,7 +161,7 @@ class ScanMatcher(nn.Module):
 
     @torch.no_grad()
     def forward(
-        self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor, kind: Tensor
+        self, depth: Tensor, proprioception: Tensor, estimate: Tensor, age: Tensor, expected: Tensor, kind: Tensor
     ) -> Tensor:
         """Where obstacles are seen, and how sure that is.
 
@@ -171,25 +169,27 @@ class ScanMatcher(nn.Module):
             depth: images ``[N, 58, 87]``, normalised or as they are stored.
             proprioception: ``[N, 45]``.
             estimate: ``[N, 4]``, the robot's height and velocity (:data:`agility_rl.keys.ESTIMATE`).
+            age: of the images, ``[N, 1]`` [s].
             expected: ``[N, 4]``: x, y [m], sine and cosine of the yaw of the obstacle, seen by the robot.
             kind: type of obstacle, int64 ``[N]``.
 
         Returns:
             ``[N, 7]``: as ``expected``, and variances of x, y [m^2] and yaw [rad^2], :data:`NOTHING` without a match.
         """
-        scan = self._scan(depth, proprioception, estimate, expected, None, (RAISED, GROUND))
+        scan = self._scan(depth, proprioception, estimate, age, expected, None, (RAISED, GROUND))
         return self._matches(scan, kind)[0]
 
     @torch.no_grad()
     def compare(
-        self, depth: Tensor, proprioception: Tensor, estimate: Tensor, expected: Tensor, slot: Tensor
+        self, depth: Tensor, proprioception: Tensor, estimate: Tensor, age: Tensor, expected: Tensor, slot: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Where an obstacle is seen if it is of each type, and how much of what stands there that explains.
 
         Args:
-            depth: as :meth:`forward`, as are the next three.
+            depth: as :meth:`forward`, as are the next four.
             proprioception: ``[N, 45]``.
             estimate: ``[N, 4]``.
+            age: ``[N, 1]``.
             expected: ``[N, 4]``.
             slot: ``[N, 4]``, as ``expected``: its place in the course, about which it may stand.
 
@@ -197,7 +197,7 @@ class ScanMatcher(nn.Module):
             Matches ``[N, K, 7]``, as :meth:`forward`; share of the raised points, less where they are few, ``[N, K]``.
         """
         count = self.field.count
-        scan = self._scan(depth, proprioception, estimate, expected, slot, (COMPARED, GROUND))
+        scan = self._scan(depth, proprioception, estimate, age, expected, slot, (COMPARED, GROUND))
         kinds = torch.arange(count, device=depth.device).repeat_interleave(len(depth))
         matches, fit = self._matches(_repeated(scan, count), kinds)
         enough = (fit.there / MANY).clamp(max=1.0) * (fit.there >= FEW)
@@ -222,14 +222,15 @@ class ScanMatcher(nn.Module):
         depth: Tensor,
         proprioception: Tensor,
         estimate: Tensor,
+        age: Tensor,
         expected: Tensor,
         slot: Tensor | None,
         most: tuple[int, int],
     ) -> _Scan:
         """At most so many points above the ground and on it, about the slot, or else where the obstacle is expected."""
-        motion = LATENCY * planar_motion(proprioception, estimate)
+        motion = age * planar_motion(proprioception, estimate)
         roll_pitch, rates = attitude(proprioception)
-        roll, pitch = (roll_pitch - LATENCY * rates[..., :2]).unbind(-1)
+        roll, pitch = (roll_pitch - age * rates[..., :2]).unbind(-1)
         robot = moved(inverted(on_grid(expected)), -motion)
         middle = robot if slot is None else moved(inverted(on_grid(slot)), -motion)
         window = self.around if slot is None else self.about_slot

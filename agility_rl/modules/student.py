@@ -55,8 +55,8 @@ class RecurrentStudent(nn.Module):
     Keys read: ``depth`` [*B, 58, 87], ``proprioception`` [*B, 45], ``history`` [*B, 10, 45], ``hidden`` [*B, 512]
     (with ``num_place`` 7 more, one for every way-point of the course, 7 and two for every type of obstacle, and one for
     every type at every slot of the course), ``is_init`` bool [*B, 1], true in the first step of an episode; with
-    assistance ``heading_error`` [*B, 2] too, and with ``num_place`` also ``progress`` [*B, S], of which the first of an
-    episode counts.
+    ``num_place`` also ``image_age`` [*B, 1] [s]; with assistance ``heading_error`` [*B, 2] too, and with ``num_place``
+    also ``progress`` [*B, S], of which the first of an episode counts.
     Keys written: ``depth_feature`` [*B, F], ``terrain_latent`` [*B, 32], ``heading_estimate`` [*B, 2],
     ``obstacle_logits`` [*B, 7], ``(memory, hidden)`` [*B, 512], ``(perceived, heading_error)``,
     ``(perceived, obstacle)``, with ``num_place`` also ``place_estimate`` [*B, 8], ``progress_logits`` [*B, S],
@@ -157,7 +157,7 @@ class RecurrentStudent(nn.Module):
             if num_place
             else Memory(*sizes)
         )
-        self.measured = [keys.PROPRIOCEPTION, *([keys.ESTIMATE, keys.DEPTH] if num_place else [])]
+        self.measured = [keys.PROPRIOCEPTION, *([keys.ESTIMATE, keys.DEPTH, keys.IMAGE_AGE] if num_place else [])]
         self.heading_gate = heading_gate
         inputs: dict[NestedKey, int] = {
             keys.PROPRIOCEPTION: features.NUM_PROPRIOCEPTION,

@@ -127,6 +127,15 @@ def test_continuation_is_bit_exact(student: RecurrentStudent, teacher: Teacher) 
     other.close()
 
 
+def test_what_another_release_observed_is_refused(env: AgilityEnv, student: RecurrentStudent, teacher: Teacher) -> None:
+    collect = collector(env, student, teacher)
+    collect.collect()
+    state = collect.state_dict()
+    del state["carrier"]["history"]
+    with pytest.raises(ValueError, match=r"the observations to go on from lack \['history'"):
+        collector(env, student, teacher).load_state_dict(state)
+
+
 def test_errors(env: AgilityEnv, student: RecurrentStudent, teacher: Teacher) -> None:
     blind = make_env(depth=None)
     with pytest.raises(ValueError, match=r"build it with a camera: AgilityEnv\(\.\.\., depth=\{\}\)"):

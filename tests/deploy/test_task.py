@@ -95,6 +95,7 @@ def test_decisions_are_those_of_the_training_policy(
             camera.frame = Frame(0.0, sensor_image(counts))
             td = TensorDict({keys.DEPTH: DepthPreprocessor()(camera.frame.image)[None]}, [1])
             td.update({keys.PROPRIOCEPTION: present[None], keys.HISTORY: history, keys.HIDDEN: hidden})
+            td[keys.IMAGE_AGE] = torch.full((1, 1), 0.02 * step)
             td["is_init"] = torch.full((1, 1), step == 0)
             with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
                 td = policy(td)
@@ -126,6 +127,19 @@ def test_its_canters_are_as_fast_as_its_manifest_says(
     for wrong, message in (("fast", r"expected fastest_canter in m/s in the manifest, got 'fast'"), (9.0, "got 9")):
         with pytest.raises(ValueError, match=message):
             deployed_student(save(fastest_canter=wrong), artifact, StillImage(1.0))
+
+
+def test_the_network_is_told_how_old_its_image_is(
+    monkeypatch: pytest.MonkeyPatch, save: Callable[..., Artifact], artifact: Artifact
+) -> None:
+    """On the controller's clock, at 7.5 s, an image of 7.44 s."""
+    camera, ages = Camera(), []
+    task = deployed_student(save(), artifact, camera)
+    network = task.network
+    monkeypatch.setattr(task, "network", lambda *inputs: ages.append(inputs[1]) or network(*inputs))
+    camera.frame = Frame(7.44, sensor_image(scene(torch.Generator().manual_seed(0))))
+    task.decide(Perception(7.5, RobotState.standing(), torch.zeros(45), torch.zeros(4)))
+    assert len(ages) == 1 and ages[0].shape == (1, 1) and ages[0].item() == pytest.approx(0.06)
 
 
 def test_it_looks_only_when_a_decision_is_due_and_forgets_at_a_start(
@@ -217,12 +231,13 @@ def test_the_network_has_no_memory_of_its_own(student: RecurrentStudent) -> None
     network, generator = StudentNetwork(student), torch.Generator().manual_seed(0)
     inputs = (
         torch.rand(1, 58, 87, generator=generator) - 0.5,
+        torch.full((1, 1), 0.02),
         torch.randn(1, 45, generator=generator),
         torch.randn(1, 10, 45, generator=generator),
         torch.randn(1, student.memory.size, generator=generator),
     )
     with torch.no_grad():
         first, second = network(*inputs), network(*inputs)
-        other = network(*inputs[:3], torch.zeros(1, student.memory.size))
+        other = network(*inputs[:-1], torch.zeros(1, student.memory.size))
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
     assert not torch.equal(first[-1], other[-1])

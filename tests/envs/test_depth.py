@@ -68,6 +68,7 @@ def test_the_newest_frame_of_at_least_the_latency_ago_is_shown(
         if step % decision_steps == 0:
             expected = max(0, (step - latency) // frame_steps * frame_steps)
             assert lift.shown() == [pytest.approx(expected, abs=0.01)], step
+            assert lift.depth.age().item() == pytest.approx(0.02 * max(step - expected, latency)), step
 
 
 def test_only_the_frames_that_are_shown_are_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,6 +100,7 @@ def test_a_new_episode_sees_its_first_frame_at_once_and_the_others_are_left_alon
     mask = torch.tensor([False, True, False])
     lift.depth.begin(mask)
     assert lift.shown() == pytest.approx([2, 4, 2], abs=0.01)
+    assert lift.depth.age()[:, 0].tolist() == pytest.approx([0.04] * 3)
     assert torch.equal(lift.depth.image()[~mask], before[~mask])
     lift.step()
     assert lift.shown() == pytest.approx([3, 4, 3], abs=0.01)  # no frame of the former episode

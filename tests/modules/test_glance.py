@@ -33,6 +33,18 @@ def test_it_learns_where_an_obstacle_is_and_how_sure_that_is() -> None:
     assert scale.exp().mean(0)[0] < 0.08 and 0.2 < scale.exp().mean(0)[1] < 0.3
 
 
+def test_it_corrects_what_is_expected_by_what_was_expected_when_the_image_was_taken() -> None:
+    glance, feature, leg = Glance(8, (4,), legs=2), torch.randn(5, 8), torch.tensor([0, 1, 1, 0, 0])
+    torch.nn.init.normal_(glance.correction[-1].weight)
+    now, then = torch.randn(2, 5, 4)
+    place, scale = glance.where(feature, now, leg, then)
+    earlier, same = glance.where(feature, then, leg)
+    torch.testing.assert_close(place - now, earlier - then)
+    assert torch.equal(scale, same) and torch.equal(
+        glance.where(feature, now, leg, now)[0], glance.where(feature, now, leg)[0]
+    )
+
+
 def test_the_layers_that_read_a_place_are_those_asked_for() -> None:
     glance = Glance(8, (4,), legs=2, hidden=(6, 5))
     sizes = [layer.weight.shape for layer in glance.correction if isinstance(layer, torch.nn.Linear)]

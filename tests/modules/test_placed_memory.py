@@ -8,7 +8,7 @@ import torch
 from agility_rl.go2 import camera, features
 from agility_rl.modules.kalman import FREEDOM
 from agility_rl.modules.placed_memory import ALIKE, DRIFT, START, PlacedMemory
-from agility_rl.modules.planar import moved
+from agility_rl.modules.planar import inverted, moved
 from agility_rl.modules.preview import NEXT, STRONGEST
 from agility_rl.modules.scan_matching import NOTHING, ScanMatcher
 from agility_rl.modules.stock import NOTED
@@ -35,7 +35,13 @@ def test_who_sees_nothing_only_counts_the_way() -> None:
     hidden = still(memory, begun.tolist())[-1]
     first = torch.zeros(steps, 1, 1, dtype=torch.bool)
     *_, after, place, _, _ = memory(
-        torch.zeros(steps, 1, 32), proprioception, estimate, torch.zeros(steps, 1, 58, 87), hidden[None], first
+        torch.zeros(steps, 1, 32),
+        proprioception,
+        estimate,
+        torch.zeros(steps, 1, 58, 87),
+        torch.full((steps, 1, 1), camera.LATENCY),
+        hidden[None],
+        first,
     )
     expected = torch.tensor([-9.0, 10.0 / math.pi, 0.0, -1.0])
     torch.testing.assert_close(after[-1, 0, 8:12] + memory.starts[0], expected, atol=0.06, rtol=0.0)
@@ -92,10 +98,27 @@ def test_what_is_matched_is_the_shape_of_the_likeliest_obstacle() -> None:
         memory, bias = silent()
         memory.matcher = ScanMatcher([[pebble]] * 3 + [[block]] + [[pebble]] * 3)
         bias["obstacle"][likeliest] = 20.0
-        feature, proprioception, _, _, hidden = still(memory, [-2.2, 0.0, 0.0, 1.0], 1)
-        *_, match = memory.step(feature, proprioception, torch.tensor([[0.27, 0.0, 0.0, 0.0]]), image, hidden)
+        feature, proprioception, _, _, age, hidden = still(memory, [-2.2, 0.0, 0.0, 1.0], 1)
+        *_, match = memory.step(feature, proprioception, torch.tensor([[0.27, 0.0, 0.0, 0.0]]), image, age, hidden)
         assert bool(match[0, 4] < NOTHING) == there and bool(match[0, 11] == NOTHING)
         assert (match[0, 0].item() == pytest.approx(2.305, abs=0.01)) == there
+
+
+@torch.no_grad()
+def test_a_glance_is_asked_about_where_the_obstacle_was_when_the_image_was_taken() -> None:
+    """At 1 m/s and 2 rad/s, an image that is 0.1 s older than in training: 0.1 m nearer since, and turned by 0.2."""
+    memory, _ = silent()
+    asked = []
+    memory.glance.correction.register_forward_hook(lambda _, inputs, __: asked.append(inputs[0]))
+    for age in (camera.LATENCY, camera.LATENCY + 0.1):
+        feature, proprioception, estimate, image, _, hidden = still(memory, [-1.0, 0.0, 0.0, 1.0], 1)
+        proprioception[:, 4] = 2.0 * features.ANGULAR_VELOCITY_SCALE
+        estimate[:, 1] = 1.0 * features.LINEAR_VELOCITY_SCALE
+        *_, place, _, _ = memory.step(feature, proprioception, estimate, image, torch.full((1, 1), age), hidden)
+    now, then = (known[:, 32:36] for known in asked)
+    torch.testing.assert_close(inverted(place[:, 4:]), now)
+    torch.testing.assert_close(moved(inverted(then), torch.tensor([[0.1, 0.0, 0.2]])), inverted(now))
+    assert then[0, 0] - now[0, 0] > 0.08
 
 
 @torch.no_grad()
@@ -119,7 +142,7 @@ def test_many_images_are_as_good_as_their_mean_and_no_better_than_alike() -> Non
     inputs = still(memory, [-1.5, 0.0, 0.0, 1.0], 1)
     state = inputs[-1]
     for _ in range(100):
-        state = memory.step(*inputs[:4], state)[3]
+        state = memory.step(*inputs[:-1], state)[3]
     expected = 1.0 / (1.0 / torch.tensor(START) + 10.0 / (2.0 * 0.3**2))
     torch.testing.assert_close(state[0, 12:15] + torch.tensor(START), expected, rtol=1e-3, atol=0.0)
 
@@ -151,7 +174,7 @@ def test_who_reaches_the_last_way_point_stands_before_the_next_obstacle() -> Non
         torch.testing.assert_close(after[0, 8:12], inputs[-1][0, 8:12], atol=1e-5, rtol=0.0)
         assert progress.exp()[0, follows] > 0.99
         torch.testing.assert_close(progress.exp().sum(), torch.tensor(1.0))
-        *_, twice, _ = memory.step(*inputs[:4], after)
+        *_, twice, _ = memory.step(*inputs[:-1], after)
         assert int(twice.argmax()) == follows, "who has left an obstacle does not leave the next one too"
 
 
@@ -246,7 +269,7 @@ def test_gradients_reach_what_was_said_earlier() -> None:
     feature = torch.randn(6, 2, 32, requires_grad=True)
     first = torch.zeros(6, 2, 1, dtype=torch.bool)
     first[3, 0] = True
-    seen = torch.randn(6, 2, 45), torch.randn(6, 2, 4), torch.zeros(6, 2, 58, 87)
+    seen = torch.randn(6, 2, 45), torch.randn(6, 2, 4), torch.zeros(6, 2, 58, 87), torch.full((6, 2, 1), 0.05)
     *_, place, _, _ = memory(feature, *seen, torch.randn(1, 2, memory.size), first)
     place[5].sum().backward()
     assert (feature.grad[3:].abs().sum(-1) > 0).all() and (feature.grad[:3, 1].abs().sum(-1) > 0).all()
@@ -259,7 +282,7 @@ def test_the_place_teaches_neither_the_obstacle_nor_what_was_expected_of_it() ->
     memory = PlacedMemory(32, 45, 8, 7, 0.04, points)
     torch.nn.init.normal_(memory.glance.correction[-1].weight)
     hidden = torch.randn(2, memory.size, requires_grad=True)
-    seen = torch.randn(2, 32), torch.randn(2, 45), torch.randn(2, 4), torch.zeros(2, 58, 87)
+    seen = torch.randn(2, 32), torch.randn(2, 45), torch.randn(2, 4), torch.zeros(2, 58, 87), torch.full((2, 1), 0.05)
     latent, _, _, _, place, _, _ = memory.step(*seen, hidden)
     place.sum().backward(retain_graph=True)
     gradient = memory.head[0].weight.grad

@@ -94,7 +94,7 @@ def test_an_episode_begins_before_the_first_obstacle_unless_told_otherwise() -> 
         begun = memory.begun(hidden, first, start)
         assert torch.equal(begun[1], hidden[1])
         *_, place, progress, _ = memory.step(
-            torch.zeros(2, 32), torch.zeros(2, 45), torch.zeros(2, 4), torch.zeros(2, 58, 87), begun
+            torch.zeros(2, 32), torch.zeros(2, 45), torch.zeros(2, 4), torch.zeros(2, 58, 87), torch.zeros(2, 1), begun
         )
         torch.testing.assert_close(place[0, 4:], torch.tensor([-1.5, 0.0, 0.0, 1.0]), atol=1e-6, rtol=0.0)
         assert float(progress[0].exp().unflatten(0, (3, 4)).sum(-1)[leg]) > 0.99

@@ -6,7 +6,16 @@ import pytest
 import torch
 
 from agility_rl.go2 import features
-from agility_rl.modules.planar import bearings, inverted, moved, planar_motion, seen_from, within
+from agility_rl.modules.planar import (
+    bearings,
+    composed,
+    inverted,
+    moved,
+    planar_motion,
+    seen_earlier,
+    seen_from,
+    within,
+)
 from agility_rl.rotations import from_euler, rotate
 
 
@@ -53,6 +62,16 @@ def test_what_is_seen_from_where_it_sees_from() -> None:
     there = inverted(pose)
     torch.testing.assert_close(there[:, :2], seen_from(pose, torch.zeros(1, 2))[:, 0])
     torch.testing.assert_close(inverted(there), pose)
+
+
+def test_what_was_seen_before_a_motion_stands_where_it_stood() -> None:
+    robot, seen = (
+        torch.cat((torch.randn(5, 2), torch.nn.functional.normalize(torch.randn(5, 2), dim=-1)), -1) for _ in range(2)
+    )
+    motion = torch.randn(5, 3)
+    before = composed(robot, seen_earlier(seen, motion))
+    torch.testing.assert_close(before, composed(moved(robot, motion), seen))
+    assert torch.equal(seen_earlier(seen, torch.zeros(5, 3)), seen), "to the last digit, where nothing moved"
 
 
 def test_a_pose_within_a_frame() -> None:

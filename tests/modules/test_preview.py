@@ -14,6 +14,7 @@ from agility_rl.modules.scan_matching import FLOOR, NOTHING, ScanMatcher
 UPRIGHT = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0)
 BLOCK, PEBBLE = (("box", size, (0.0, 0.0, size[2]), *UPRIGHT) for size in ((0.4, 0.8, 0.8), (0.02, 0.02, 0.02)))
 STANDING = torch.tensor([[0.27, 0.0, 0.0, 0.0]])
+AGE = torch.full((1, 1), camera.LATENCY)
 
 
 def block_ahead() -> torch.Tensor:
@@ -39,7 +40,7 @@ def test_the_likeliest_type_is_matched_where_its_shape_fits() -> None:
     """A block in view, expected 0.1 m too near; the other two types are pebbles."""
     preview, matcher = Preview(3), ScanMatcher([[PEBBLE], [BLOCK], [PEBBLE]])
     memory, place = torch.zeros(1, preview.size), torch.tensor([[-2.2, 0.0, 0.0, 1.0]])
-    measured = block_ahead(), torch.zeros(1, 45), STANDING
+    measured = block_ahead(), torch.zeros(1, 45), STANDING, AGE
     said = preview.look(matcher, torch.tensor([True]), *measured, memory, place, evenly(preview, memory))
     assert said.shape == (1, preview.said) and said[0, 0].item() == pytest.approx(2.305, abs=0.03)
     assert bool((said[0, 4:7] < 0.1**2).all())
@@ -63,7 +64,7 @@ def test_a_type_that_is_unlikely_beforehand_is_not_matched() -> None:
     """Evidence is what it was, but the pebble is what it is taken for, and that fits nowhere."""
     preview, matcher = Preview(2), ScanMatcher([[PEBBLE], [BLOCK]])
     memory, place = torch.zeros(1, preview.size), torch.tensor([[-2.2, 0.0, 0.0, 1.0]])
-    inputs = matcher, torch.tensor([True]), block_ahead(), torch.zeros(1, 45), STANDING, memory, place
+    inputs = matcher, torch.tensor([True]), block_ahead(), torch.zeros(1, 45), STANDING, AGE, memory, place
     even = preview.look(*inputs, evenly(preview, memory))
     pebble = preview.look(*inputs, torch.tensor([[0.0, -1.0]]))
     assert torch.equal(even[:, 7:], pebble[:, 7:])
@@ -75,7 +76,7 @@ def test_what_is_out_of_view_or_not_there_is_left_as_it_was(x: float, is_next: b
     preview, matcher = Preview(2), ScanMatcher([[BLOCK], [PEBBLE]])
     memory, place = known(preview), torch.tensor([[x, 0.0, 0.0, 1.0]])
     memory[:, 7:] = 0.0
-    measured = block_ahead(), torch.zeros(1, 45), STANDING
+    measured = block_ahead(), torch.zeros(1, 45), STANDING, AGE
     said = preview.look(matcher, torch.tensor([is_next]), *measured, memory, place, evenly(preview, memory))
     assert torch.equal(said, preview.silence(memory, place)) and (said[:, 4:7] == NOTHING).all()
     torch.testing.assert_close(preview.told(memory, place, said), memory, atol=1e-6, rtol=0.0)
@@ -85,7 +86,7 @@ def test_rows_do_not_mix() -> None:
     """Of four robots the second and the last look at the block; the others have it behind them."""
     preview, matcher = Preview(2), ScanMatcher([[BLOCK], [PEBBLE]])
     place = torch.tensor([[2.2, 0.0, 0.0, 1.0], [-2.2, 0.0, 0.0, 1.0], [2.2, 0.0, 0.0, 1.0], [-2.4, 0.0, 0.0, 1.0]])
-    measured = block_ahead().expand(4, -1, -1), torch.zeros(4, 45), STANDING.expand(4, 4)
+    measured = block_ahead().expand(4, -1, -1), torch.zeros(4, 45), STANDING.expand(4, 4), AGE.expand(4, 1)
     memory, there = torch.zeros(4, preview.size), torch.ones(4, dtype=torch.bool)
     said = preview.look(matcher, there, *measured, memory, place, evenly(preview, memory))
     assert (said[:, 4] < NOTHING).tolist() == [False, True, False, True]

@@ -35,7 +35,7 @@ def matcher() -> ScanMatcher:
     return ScanMatcher(SOLIDS)
 
 
-def standing(name: str, noise: float = 0.0, walls: bool = True) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
+def standing(name: str, noise: float = 0.0, walls: bool = True) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
     """What robots that have just been stood before an obstacle measure, where they see it, and its type."""
     camera_errors = {"pitch": noise * camera.PITCH_JITTER, "offset_noise": 0.05 * noise, "pixel_noise": 0.05 * noise}
     env = AgilityEnv(
@@ -52,7 +52,7 @@ def standing(name: str, noise: float = 0.0, walls: bool = True) -> tuple[tuple[T
     estimate = torch.cat((env.simulator.root_position[:, 2:], torch.zeros(ROBOTS, 3)), -1)
     seen = inverted(td[keys.PLACE][:, 4:])
     env.close()
-    return (td[keys.DEPTH], td[keys.PROPRIOCEPTION], estimate), seen, td[keys.OBSTACLE].argmax(-1)
+    return (td[keys.DEPTH], td[keys.PROPRIOCEPTION], estimate, td[keys.IMAGE_AGE]), seen, td[keys.OBSTACLE].argmax(-1)
 
 
 def beside(seen: Tensor, seed: int = 0) -> Tensor:
@@ -85,29 +85,34 @@ def test_an_obstacle_is_found_where_it_stands(matcher: ScanMatcher, name: str, n
 
 
 def test_who_sees_nothing_is_told_nothing(matcher: ScanMatcher) -> None:
-    (_, proprioception, estimate), seen, kind = standing("tunnel")
+    (_, proprioception, estimate, age), seen, kind = standing("tunnel")
     estimate[:, 1] = 3.0 * features.LINEAR_VELOCITY_SCALE  # where it was expected, however fast the robot is
     far = torch.full((ROBOTS, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH), 0.5)
     seen = on_grid(seen)
-    match = matcher(far, proprioception, estimate, seen, kind)
+    match = matcher(far, proprioception, estimate, age, seen, kind)
     assert (match[:, 4:] == NOTHING).all()
     torch.testing.assert_close(match[:, :4], seen, atol=1e-4, rtol=0.0)
 
 
-def test_an_image_is_one_frame_old(matcher: ScanMatcher) -> None:
-    """In 0.02 s, 3.125 m/s forward are 0.0625 m, by which all is nearer now; 2 rad/s of roll or pitch are 0.04 rad."""
-    (depth, proprioception, estimate), seen, kind = standing("tunnel")
+def test_robots_have_moved_since_an_image_was_taken(matcher: ScanMatcher) -> None:
+    """In 0.02 s, 3.125 m/s forward are 0.0625 m, by which all is nearer now; 2 rad/s of roll or pitch are 0.04 rad.
+
+    In 0.04 s half of that speed is as far.
+    """
+    (depth, proprioception, estimate, age), seen, kind = standing("tunnel")
     expected = on_grid(beside(seen))
-    still = matcher(depth, proprioception, estimate, expected, kind)
+    still = matcher(depth, proprioception, estimate, age, expected, kind)
     moving, nearer = estimate.clone(), torch.tensor([0.0625, 0.0, 0.0, 0.0])
     moving[:, 1] = 3.125 * features.LINEAR_VELOCITY_SCALE
-    match = matcher(depth, proprioception, moving, expected - nearer, kind)
+    match = matcher(depth, proprioception, moving, age, expected - nearer, kind)
     torch.testing.assert_close(match[:, :4], still[:, :4] - nearer, atol=1e-4, rtol=0.0)
+    moving[:, 1] /= 2.0
+    torch.testing.assert_close(matcher(depth, proprioception, moving, 2.0 * age, expected - nearer, kind), match)
     for axis in (0, 1):
         leaning = proprioception.clone()
         leaning[:, axis] += 0.04
         leaning[:, 2 + axis] += 2.0 * features.ANGULAR_VELOCITY_SCALE
-        match = matcher(depth, leaning, estimate, expected, kind)
+        match = matcher(depth, leaning, estimate, age, expected, kind)
         torch.testing.assert_close(match[:, :4], still[:, :4], atol=1e-4, rtol=0.0)
 
 
@@ -126,7 +131,8 @@ def test_what_explains_too_little_or_lies_too_far_off_does_not_count(
     ground = (0.27 + camera.POSITION[2]) / (-camera.pixel_directions()[..., 2]).clamp(min=1e-6)
     image = camera.normalize_depth(torch.minimum(ground, depth))[None]
     still, standing, place = torch.zeros(1, 45), torch.tensor([[0.27, 0.0, 0.0, 0.0]]), [[expected, 0.0, 0.0, 1.0]]
-    match = ScanMatcher([[BLOCK]])(image, still, standing, torch.tensor(place), torch.tensor([0]))[0]
+    age = torch.full((1, 1), camera.LATENCY)
+    match = ScanMatcher([[BLOCK]])(image, still, standing, age, torch.tensor(place), torch.tensor([0]))[0]
     assert match[0].item() == pytest.approx(2.305, abs=0.01)
     assert bool((match[4:] < NOTHING).all()) == counts
 
@@ -140,14 +146,14 @@ def test_another_obstacle_is_not_taken_for_it(matcher: ScanMatcher) -> None:
 
 
 def test_rows_do_not_mix_and_stored_images_say_the_same(matcher: ScanMatcher) -> None:
-    (depth, proprioception, estimate), seen, kind = standing("tire_jump", 1.0)
+    (depth, proprioception, estimate, age), seen, kind = standing("tire_jump", 1.0)
     expected = beside(seen)
-    match = matcher(depth, proprioception, estimate, expected, kind)
-    alone = matcher(depth[3:4], proprioception[3:4], estimate[3:4], expected[3:4], kind[3:4])
+    match = matcher(depth, proprioception, estimate, age, expected, kind)
+    alone = matcher(*(part[3:4] for part in (depth, proprioception, estimate, age, expected, kind)))
     torch.testing.assert_close(alone[0], match[3], rtol=1e-3, atol=1e-4)
-    stored = matcher(camera.quantize(depth, 16), proprioception, estimate, expected, kind)
+    stored = matcher(camera.quantize(depth, 16), proprioception, estimate, age, expected, kind)
     assert errors(stored, match).median() < 1e-3
-    assert not matcher(depth.requires_grad_(), proprioception, estimate, expected, kind).requires_grad
+    assert not matcher(depth.requires_grad_(), proprioception, estimate, age, expected, kind).requires_grad
 
 
 def test_points_are_turned_by_hand(matcher: ScanMatcher) -> None:
@@ -233,7 +239,8 @@ def test_a_wall_is_not_taken_for_what_a_slot_holds(matcher: ScanMatcher, aside: 
     wall = (aside + camera.POSITION[1]) / (-rays[..., 1]).clamp(min=1e-6)
     measured = camera.normalize_depth(torch.minimum(ground, wall))[None], torch.zeros(1, 45)
     height, slot = torch.tensor([[0.27, 0.0, 0.0, 0.0]]), torch.tensor([[2.5, 0.0, 0.0, 1.0]])
-    _, share = matcher.compare(*measured, height, slot - torch.tensor([0.0, 0.6, 0.0, 0.0]), slot)
+    age = torch.full((1, 1), camera.LATENCY)
+    _, share = matcher.compare(*measured, height, age, slot - torch.tensor([0.0, 0.6, 0.0, 0.0]), slot)
     assert bool((share > 0.2).any()) is counts and (counts or not share.any())
 
 

@@ -32,6 +32,7 @@ def steps(time: int, robots: int, size: int = M) -> TensorDict:
     return TensorDict(
         {
             "depth": torch.rand(time, robots, 58, 87) - 0.5,
+            "image_age": torch.full((time, robots, 1), 0.04),
             "proprioception": torch.randn(time, robots, 45),
             "history": torch.randn(time, robots, 10, 45),
             "heading_error": torch.rand(time, robots, 2) * 2.0 - 1.0,

@@ -106,6 +106,7 @@ def test_a_student_is_exported_with_its_memory(
     assert entry["checked_on"] == "48 recorded inputs" and entry["largest_difference"] <= 1e-5
     assert entry["inputs"] == {
         "depth": [1, 58, 87],
+        "image_age": [1, 1],
         "proprioception": [1, 45],
         "history": [1, 10, 45],
         "hidden": [1, 55],
