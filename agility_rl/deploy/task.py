@@ -61,7 +61,7 @@ class StudentNetwork(nn.Module):
         self, depth: Tensor, age: Tensor, proprioception: Tensor, history: Tensor, hidden: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Logits, parameters, heading errors [rad], obstacle logits, memory."""
-        known = dict(zip(INPUTS, (depth, age, proprioception, history), strict=False))
+        known = dict(zip(INPUTS[:-1], (depth, age, proprioception, history), strict=True))
         known[keys.ESTIMATE] = self.estimator(*(known[name] for name in self.estimated))
         latent, heading, obstacle, after, *places = self.memory.step(
             self.encoder(depth), *(known[name] for name in self.measured), hidden
