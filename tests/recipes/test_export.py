@@ -117,8 +117,9 @@ def test_a_student_is_exported_with_its_memory(
     memories = [torch.zeros(1, 55), torch.zeros(1, 55)]
     for _ in range(20):  # the memory does not drift apart
         depth = torch.rand(1, 58, 87, generator=generator) - 0.5
+        age = 0.1 * torch.rand(1, 1, generator=generator)
         rest = [torch.randn(1, *shape, generator=generator) for shape in ((45,), (10, 45))]
-        answers = [net(depth, *rest, memory) for net, memory in zip(networks, memories, strict=True)]
+        answers = [net(depth, age, *rest, memory) for net, memory in zip(networks, memories, strict=True)]
         ours, theirs = answers
         assert export.difference(ours[:-1], theirs[:-1]) <= 1e-5
         # The logarithm of a belief moves by 50 for each metre, of which float32 rounds 4 to 2.4e-7 at every step.
