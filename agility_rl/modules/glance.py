@@ -65,8 +65,8 @@ class Glance(nn.Module):
         Args:
             feature: of the images, ``[*B, F]``.
             expected: where it is expected, ``[*B, 4]``.
-            leg: which obstacle of the course.
-            then: where it was expected when the image was taken, if that is longer ago than in training.
+            leg: which obstacle of the course, int64 ``[*B]``.
+            then: ``[*B, 4]``, where it was expected when the image was taken, if that is longer ago than in training.
         """
         shown = expected if then is None else then
         known = torch.cat((feature, shown, nn.functional.one_hot(leg, self.legs).to(feature.dtype)), -1)
