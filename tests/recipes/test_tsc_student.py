@@ -228,19 +228,21 @@ def test_sixteen_bits_without_byol_from_another_student(recipe: ModuleType, smok
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_a_student_of_another_teacher_takes_this_ones_estimator_unless_it_has_its_own(
-    recipe: ModuleType, smoke: Any, make_student: Callable[..., Path], own: bool
+@pytest.mark.parametrize("actor", [False, True])
+def test_a_student_of_another_teacher_takes_this_ones_parts_that_do_not_learn(
+    recipe: ModuleType, smoke: Any, make_student: Callable[..., Path], own: bool, actor: bool
 ) -> None:
-    """It is not learned, and belongs to the controller below."""
-    smoke = replace(smoke, estimator_history=own)
+    """Its estimator, unless it has one of its own; without ``--imitation.actor`` actor and history encoder."""
+    smoke = replace(smoke, estimator_history=own, imitation=replace(smoke.imitation, actor=actor))
+    kept = ("estimator.",) * (not own) + ("actor.", "history_encoder.") * (not actor)
     other = Artifact.load(make_student("other", own_estimator=own))
-    state = {n: value + float(n.startswith(("estimator.", "memory."))) for n, value in other.state.items()}
+    changed = ("estimator.", "memory.", "actor.", "history_encoder.")
+    state = {n: value + float(n.startswith(changed)) for n, value in other.state.items()}
     Artifact.save(other.folder, state, other.manifest)
     run = recipe.train(replace(smoke, name="child", init_from=other.folder, iterations=0))
     began, teacher = Artifact.load(run / "policy").state, Artifact.load(smoke.teacher / "policy").state
-    inherited = teacher if not own else state
-    assert all(torch.equal(began[n], (inherited if n.startswith("estimator.") else state)[n]) for n in state)
-    assert any(name.startswith("estimator.") for name in state)
+    assert all(torch.equal(began[n], (teacher if n.startswith(kept) else state)[n]) for n in state)
+    assert all(any(n.startswith(part) for n in state) for part in changed)
 
 
 def test_an_estimator_of_its_own_learns_before_the_imitation(
