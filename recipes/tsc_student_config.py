@@ -97,7 +97,7 @@ class ImitationConfig:
     """Whose parameters are compared: of all behaviours (method notes, section 5.9), or of the teacher's choice."""
     actor: bool = True
     """Whether actor and history encoder learn on (method notes, section 5.9). Without, they stay the teacher's, and
-    gradients pass through them to what is perceived; such an actor drives better (docs/student_experiments.md)."""
+    gradients pass through them to what is perceived (docs/student_experiments.md, "The actor")."""
     led: float = 0.0
     """Share of the robots that do what the teacher says, at first; it falls to 0 (ours; Ross et al. 2011)."""
     led_until: int = 150
