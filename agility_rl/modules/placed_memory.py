@@ -198,7 +198,7 @@ class PlacedMemory(nn.Module):
         """Steps of ``[T, *B]``: latent, heading errors [rad], obstacle logits, memory after, place, progress, matches.
 
         Progress are log-probabilities. ``look`` is an image ``[58, 87]``, or what came of it: the match of the present
-        obstacle, that of the next one, and what speaks for its types; ``age`` is how old it is [s].
+        obstacle, that of the next one, and what speaks for its types; ``age`` ``[1]`` is how old the image is [s].
         Of ``hidden`` only the first step's counts; it begins as :meth:`begun` does.
         """
         state, steps = hidden[0], []
