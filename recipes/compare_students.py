@@ -94,6 +94,8 @@ def conclude(found: Mapping[str, Any], teacher: int | None, episodes: int) -> di
             group["loss"] = {key: metrics.mean_interval(value) for key, value in loss.items()}
             if loss:
                 group["mean_loss"] = metrics.mean_interval(torch.stack(tuple(loss.values())).mean(0))
+                passed = torch.tensor([[run[key] for key in disturbed] for run in runs]) / episodes
+                group["mean_disturbed"] = metrics.mean_interval(passed.mean(1))
         groups[name] = group
     targets: list[dict[str, Any]] = []
 
@@ -105,10 +107,14 @@ def conclude(found: Mapping[str, Any], teacher: int | None, episodes: int) -> di
             if "none" in group["success"]:
                 share = group["success"]["none"].estimate * episodes / teacher
                 add(f"{name}: success / the teacher's", share, f">= {OF_TEACHER:g}", share >= OF_TEACHER)
-    losses = [groups[name]["mean_loss"].estimate for name in GROUPS.values() if "mean_loss" in groups.get(name, {})]
-    if len(losses) == 2 and losses[1] > 0.0:  # else there is nothing to halve
-        limit = HALVED * losses[1]
-        add("mean loss of success with BYOL", losses[0], f"<= {limit:.3f}, half of that without", losses[0] <= limit)
+    both = [groups[name] for name in GROUPS.values() if "mean_loss" in groups.get(name, {})]
+    if len(both) == 2 and both[1]["mean_loss"].estimate > 0.0:  # else there is nothing to halve
+        loss, limit = both[0]["mean_loss"].estimate, HALVED * both[1]["mean_loss"].estimate
+        add("mean loss of success with BYOL", loss, f"<= {limit:.3f}, half of that without", loss <= limit)
+        # Who passes less undisturbed has less to lose.
+        disturbed, least = (group["mean_disturbed"].estimate for group in both)
+        target = f">= {least:.3f}, that without"
+        add("mean success under disturbance with BYOL", disturbed, target, disturbed >= least)
     return {"groups": groups, "targets": targets}
 
 

@@ -36,13 +36,17 @@ def test_conclusions_by_hand(recipe: ModuleType) -> None:
     assert without["success"]["none"].low == pytest.approx(0.711, abs=1e-3)  # Wilson, 80 of 100
     assert with_byol["loss"]["noise"].estimate == pytest.approx(0.04)
     assert (with_byol["mean_loss"].estimate, without["mean_loss"].estimate) == pytest.approx((0.03, 0.15))
+    assert (with_byol["mean_disturbed"].estimate, without["mean_disturbed"].estimate) == pytest.approx((0.89, 0.65))
     assert [(row["name"], row["passed"]) for row in result["targets"]] == [
         ("with BYOL: success / the teacher's", True),
         ("without BYOL: success / the teacher's", False),
         ("mean loss of success with BYOL", True),
+        ("mean success under disturbance with BYOL", True),
     ]
     worse = recipe.conclude(found | {"b": run(True, 94, 70, 80)}, None, 100)["targets"]
-    assert [(row["name"], row["passed"]) for row in worse] == [("mean loss of success with BYOL", False)]
+    assert [row["passed"] for row in worse] == [False, True]
+    nothing_to_lose = {"a": run(True, 50, 50, 50), "c": run(False, 80, 60, 70)}
+    assert [row["passed"] for row in recipe.conclude(nothing_to_lose, None, 100)["targets"]] == [True, False]
     lossless = {"a": run(True, 9, 9, 9), "c": run(False, 9, 9, 9)}
     assert recipe.conclude(lossless, None, 10)["targets"] == [], "where nothing is lost there is nothing to halve"
 
