@@ -1,8 +1,9 @@
 """Students with and without BYOL, of several seeds: success under each disturbance of their camera.
 
 In:  run folders of ``tsc_student.py`` (each says itself whether it was trained with BYOL) and that of their teacher.
-Out: tables on the screen, ``OUTPUT/student_comparison.json`` (also after every cell, so that what is done is not lost)
-     and ``OUTPUT/figures/success_under_disturbance.png``.
+Out: tables on the screen, ``OUTPUT/student_comparison.json``, ``OUTPUT/figures/success_under_disturbance.png`` and
+     ``OUTPUT/cells.json``: every student's successes under each disturbance, written as soon as they are known. What
+     stands there is not done again: stop it whenever you like, and start it again, with further students too.
 
     python recipes/compare_students.py runs/with_0 runs/with_1 runs/without_0 runs/without_1 --teacher runs/my_teacher
 
@@ -34,6 +35,9 @@ from tsc_setup import course_of
 from agility_rl.record.plots import new_figure, save_figure
 from agility_rl.training import cli, metrics, run_folder
 
+CELLS_FILE = "cells.json"
+SETTINGS = ("course", "strength", "episodes", "robots", "episode_length", "seed")
+"""Options that all cells of a file share."""
 GROUPS = {True: "with BYOL", False: "without BYOL"}
 OF_TEACHER, HALVED = 0.9, 0.5
 """Targets of stage 4: share of the teacher's success, and of the loss of success under disturbance."""
@@ -65,6 +69,21 @@ class Config:
     """Threads of the simulator."""
     output: Path = Path("runs/student_comparison")
     """Folder of the results."""
+
+
+def measured_before(config: Config) -> dict[str, dict[str, Any]]:
+    """Cells of earlier calls with the same ``--output``: by weights and disturbance ``successes`` and ``obstacles``.
+
+    Raises:
+        ValueError: if they are damaged, or were measured with other options than those asked for.
+    """
+    file = config.output / CELLS_FILE
+    found = run_folder.read_json(file)
+    if found is None:
+        return {}
+    if other := [name for name in SETTINGS if found["settings"][name] != getattr(config, name)]:
+        raise ValueError(f"{file} was measured with other {', '.join(other)}; choose another --output, or remove it")
+    return found["cells"]
 
 
 def rate(successes: Sequence[int], episodes: int) -> metrics.Interval:
@@ -177,18 +196,11 @@ def compare(config: Config, console: Console) -> dict[str, Any]:
         for name, student in zip(names, students, strict=True):
             if student.manifest["teacher"] != teacher.weights:
                 raise ValueError(f"{name} did not learn from the teacher of {config.teacher}; give the one it names")
-    found: dict[str, Any] = {}
-    result: dict[str, Any] = {
-        "format": "agility_rl.student_comparison",
-        "format_version": 1,
-        "course": config.course,
-        "episodes": config.episodes,
-        "settings": config,
-        "versions": run_folder.versions(),
-        "runs": found,
-        "teacher": None,
-        "complete": False,
-    }
+    cells = measured_before(config)
+    if cells:  # by other rules of the package, perhaps
+        file = config.output / CELLS_FILE
+        console.print(f"{file}: what stands there is not measured again; remove it for that", highlight=False)
+    settings = {name: getattr(config, name) for name in SETTINGS}
     options = CourseConfig(
         episodes=config.episodes,
         robots=config.robots,
@@ -200,24 +212,39 @@ def compare(config: Config, console: Console) -> dict[str, Any]:
 
     with Progress(console=console, transient=True) as bar:
 
-        def count(decider: Decider, disturbance: Disturbance) -> tuple[int, dict[str, Any]]:
-            task = bar.add_task(f"{decider.name}, {disturbance.label}", total=config.episodes)
-            episodes = simulate(course, decider, options, lambda: bar.advance(task), disturbance)
-            bar.remove_task(task)
-            summary = summarise(course, episodes)
-            return sum(episode.success for episode in episodes), summary["obstacles"]
+        def cell(decider: Decider, key: str, disturbance: Disturbance) -> dict[str, Any]:
+            done = cells.setdefault(str(decider.weights), {})
+            if key not in done:
+                task = bar.add_task(f"{decider.name}, {disturbance.label}", total=config.episodes)
+                episodes = simulate(course, decider, options, lambda: bar.advance(task), disturbance)
+                bar.remove_task(task)
+                successes = sum(episode.success for episode in episodes)
+                done[key] = to_json({"successes": successes, "obstacles": summarise(course, episodes)["obstacles"]})
+                written = {"format": "agility_rl.student_cells", "settings": settings, "cells": cells}
+                run_folder.write_json(config.output / CELLS_FILE, to_json(written))
+            return done[key]
 
-        if teacher is not None:
-            successes, obstacles = count(teacher, chosen(("none",))["none"])
-            result["teacher"] = {"run": teacher.name, "successes": successes, "obstacles": obstacles}
-        for name, student in zip(names, students, strict=True):
-            entry: dict[str, Any] = {"byol": bool(student.manifest["byol"]), "weights": student.weights}
-            found[name] = entry | {"successes": {}, "obstacles": {}}
-            for key, disturbance in disturbances.items():
-                found[name]["successes"][key], found[name]["obstacles"][key] = count(student, disturbance)
-                run_folder.write_json(config.output / "student_comparison.json", to_json(result))
-    beside = None if result["teacher"] is None else result["teacher"]["successes"]
-    result |= conclude(found, beside, config.episodes) | {"complete": True, "seconds": time.monotonic() - begin}
+        def by_disturbance(decider: Decider) -> dict[str, dict[str, Any]]:
+            row = {key: cell(decider, key, disturbance) for key, disturbance in disturbances.items()}
+            return {name: {key: one[name] for key, one in row.items()} for name in ("successes", "obstacles")}
+
+        beside = None if teacher is None else cell(teacher, "none", chosen(("none",))["none"])
+        found = {
+            name: {"byol": bool(student.manifest["byol"]), "weights": student.weights} | by_disturbance(student)
+            for name, student in zip(names, students, strict=True)
+        }
+    result = {
+        "format": "agility_rl.student_comparison",
+        "format_version": 1,
+        "course": config.course,
+        "episodes": config.episodes,
+        "settings": config,
+        "versions": run_folder.versions(),
+        "runs": found,
+        "teacher": None if teacher is None or beside is None else {"run": teacher.name} | beside,
+        **conclude(found, None if beside is None else beside["successes"], config.episodes),
+        "seconds": time.monotonic() - begin,
+    }
     run_folder.write_json(config.output / "student_comparison.json", to_json(result))
     figure = bars(result["groups"], disturbances)
     save_figure(figure, config.output / "figures" / "success_under_disturbance.png")

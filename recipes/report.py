@@ -51,20 +51,6 @@ class Config:
     """Run folder."""
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
-    """A JSON file, or None where there is none.
-
-    Raises:
-        ValueError: if the file is damaged.
-    """
-    if not path.is_file():
-        return None
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}; make it again") from error
-
-
 def outdated(weights: str | None, evaluations: Mapping[str, Any]) -> list[str]:
     """Notes on evaluations, by recipe, of other weights than those that a run shows now."""
     text = "an earlier policy of this run was evaluated: run recipes/{}.py on it again"
@@ -182,9 +168,9 @@ def page(run: Path) -> str:
     Raises:
         FileNotFoundError: if the folder is no run.
     """
-    record, found = read_json(run / run_folder.CONFIG_FILE), read_json(run / "evaluation.json")
-    courses = {folder: read_json(folder / "course_evaluation.json") for folder in (run, run / COURSE)}
-    manifest = read_json(run / "policy" / "manifest.json") or {}
+    record, found = run_folder.read_json(run / run_folder.CONFIG_FILE), run_folder.read_json(run / "evaluation.json")
+    courses = {folder: run_folder.read_json(folder / "course_evaluation.json") for folder in (run, run / COURSE)}
+    manifest = run_folder.read_json(run / "policy" / "manifest.json") or {}
     if record is None and found is None and not any(courses.values()):
         files = f"{run_folder.CONFIG_FILE}, evaluation.json or course_evaluation.json"
         raise FileNotFoundError(f"{run}: expected a run folder with {files}; check the path")

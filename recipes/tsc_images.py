@@ -36,7 +36,7 @@ IMAGES_FILE = "images.safetensors"
 class Config:
     student: Path = Path("pretrained/student_leaping")
     """Run or artifact folder of the student, which walks where it is not led."""
-    teacher: Path = Path("pretrained/teacher_wary")
+    teacher: Path = Path("pretrained/teacher_leaping")
     """Run or artifact folder of its teacher."""
     bbc: Path | None = None
     """Run or artifact folder of the Basic Behaviour Controller of both; found by default."""

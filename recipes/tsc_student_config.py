@@ -176,7 +176,7 @@ class Config(HardwareConfig):
     """Folder of all runs."""
     seed: int = 0
     """Of everything that is drawn."""
-    teacher: Path = Path("pretrained/teacher_wary")
+    teacher: Path = Path("pretrained/teacher_leaping")
     """Run or artifact folder of the teacher; the student decides as often, on the same behaviours."""
     bbc: Path | None = None
     """Run or artifact folder of the Basic Behaviour Controller that the teacher was trained on; found by default."""

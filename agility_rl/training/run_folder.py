@@ -146,6 +146,20 @@ def write_json(path: Path, value: Any) -> None:
     publish(staged, path)
 
 
+def read_json(path: Path) -> Any:
+    """What a JSON file holds, or None where there is none.
+
+    Raises:
+        ValueError: if the file is damaged.
+    """
+    if not path.is_file():
+        return None
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}; make it again") from error
+
+
 def versions() -> dict[str, str]:
     """Versions of this package, of what it stands on, of Python, and of the source when it is a git checkout."""
     found = {"agility_rl": agility_rl.__version__, "python": platform.python_version()}

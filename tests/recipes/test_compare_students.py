@@ -70,12 +70,32 @@ def test_students_are_compared_on_the_same_courses(
     console = Console(file=StringIO(), width=200)
     recipe.compare(config, console)
     found = json.loads((tmp_path / "out" / "student_comparison.json").read_text())
-    assert [run["byol"] for run in found["runs"].values()] == [True, False] and found["complete"]
+    assert [run["byol"] for run in found["runs"].values()] == [True, False]
     assert all(run["successes"] == {"none": 0, "blur": 0} for run in found["runs"].values())
     assert found["groups"]["without BYOL"]["success"]["blur"]["estimate"] == 0.0
     assert found["teacher"]["successes"] == 0 and found["targets"] == []
     assert "Gaussian blur" in console.file.getvalue()
     assert (tmp_path / "out" / "figures" / "success_under_disturbance.png").is_file()
+
+    # What was measured stands: changed by hand, it is found again; what is missing is added.
+    cells = tmp_path / "out" / "cells.json"
+    known = json.loads(cells.read_text())
+    assert [sorted(cell) for cell in known["cells"].values()] == [["none"], *[["blur", "none"]] * 2]
+    weights = found["runs"][str(runs[0])]["weights"]
+    known["cells"][weights]["none"]["successes"] = 2
+    del known["cells"][weights]["blur"]
+    cells.write_text(json.dumps(known))
+    again = recipe.compare(replace(config, runs=runs[:1], teacher=None), console)
+    assert again["runs"][str(runs[0])]["successes"] == {"none": 2, "blur": 0}
+    assert f"{cells}: what stands there is not measured again" in console.file.getvalue().replace("\n", "")
+    assert len(json.loads(cells.read_text())["cells"]) == 3, "those of others stay"
+    with pytest.raises(ValueError, match=r"cells\.json was measured with other episodes, seed; choose another"):
+        recipe.compare(replace(config, episodes=1, seed=2), console)
+    cells.write_text("{")
+    with pytest.raises(ValueError, match=r"cells\.json is damaged: .*; make it again"):
+        recipe.compare(config, console)
+    cells.unlink()
+
     with pytest.raises(ValueError, match="two folders hold the same weights"):
         recipe.compare(replace(config, runs=(runs[0], runs[0] / "policy")), console)
     with pytest.raises(ValueError, match=r"expected a student of tsc_student\.py, got an artifact of kind 'teacher'"):

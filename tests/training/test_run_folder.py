@@ -13,7 +13,16 @@ from pathlib import Path
 import pytest
 
 import agility_rl
-from agility_rl.training.run_folder import abandon_run, from_json, read_config, start_run, to_json, versions
+from agility_rl.training.run_folder import (
+    abandon_run,
+    from_json,
+    read_config,
+    read_json,
+    start_run,
+    to_json,
+    versions,
+    write_json,
+)
 
 
 @dataclass(frozen=True)
@@ -48,6 +57,16 @@ def test_the_commit_is_that_of_the_package_and_of_no_checkout_around_it(tmp_path
     for arguments in (("add", "."), ("commit", "-q", "-m", "a fork")):
         subprocess.run([*git, *arguments], check=True)
     assert told() == "True"
+
+
+def test_json_that_is_missing_is_none_and_damaged_is_an_error(tmp_path: Path) -> None:
+    file = tmp_path / "found.json"
+    assert read_json(file) is None
+    write_json(file, {"cells": [1, None]})
+    assert read_json(file) == {"cells": [1, None]}
+    file.write_text(file.read_text()[:-3])
+    with pytest.raises(ValueError, match=r"found\.json is damaged: .*; make it again"):
+        read_json(file)
 
 
 def test_a_run_folder_is_never_overwritten(tmp_path: Path) -> None:
