@@ -228,8 +228,8 @@ class Config(HardwareConfig):
 
 PAPER = Config()
 CPU = Config(
-    iterations=450,
-    max_minutes=120.0,
+    iterations=330,
+    max_minutes=150.0,
     checkpoint_every=25,
     byol=False,
     precision="auto",
@@ -244,12 +244,15 @@ CPU = Config(
         steps=48,
         epochs=4,
         minibatches=4,
-        decay=450,
+        decay=330,
+        behaviour=0.0,  # the actor is the teacher's, so that memory and encoder alone learn
+        continuous=0.0,
+        actor=False,
         place=0.5,
         latent=2.0,
         compared="selected",
         led=0.8,
-        led_until=160,
+        led_until=117,
     ),
     representation=RepresentationConfig(images=384, minibatches=1),
     glance=GlanceConfig(
@@ -275,7 +278,7 @@ SMOKE = replace(
     encoder_features=8,
     glance_hidden=(8, 8),
     env=replace(CPU.env, num_robots=4),
-    imitation=replace(CPU.imitation, steps=4, epochs=1, minibatches=2),
+    imitation=replace(CPU.imitation, steps=4, epochs=1, minibatches=2, behaviour=1.0, continuous=1.0, actor=True),
     representation=replace(CPU.representation, images=8, hidden=16),
     glance=GlanceConfig(images=8, every=1, epochs=1, batch=4, held_out=0.25, kept=16),
     estimation=EstimationConfig(robots=2, decisions=4, epochs=1, batch=4),

@@ -273,8 +273,7 @@ def test_a_student_commands_canters_as_fast_as_its_teacher(
     run = recipe.train(replace(smoke, name="fast", iterations=1, init_from=own))
     assert [Artifact.load(one / "policy").manifest["fastest_canter"] for one in (own, run)] == [2.0, 3.2]
     setup = module("tsc_student_setup")
-    cfg, trained = setup.resolve(replace(smoke, init_from=own))
-    parts = setup.build(cfg, trained)
+    parts = setup.build(*setup.resolve(replace(smoke, init_from=own)))
     assert parts.env.decisions.bounds[1][3, 0].item() == pytest.approx(3.2)
     setup.load_student(parts, own, ())
     name = "actor.module.0.module.parameters_head.mean.0.weight"  # the canter's speed is row 18 of 30
@@ -296,15 +295,17 @@ def test_labels_are_what_is_applied(module: Module, smoke: Any) -> None:
     parts.env.close()
 
 
-def test_learning_rates_fall(module: Module) -> None:
-    rates = module("learning_rates")
-    annealed = [rates.annealed(1e-3, 1e-5, n, 100) for n in (0, 50, 100, 500)]
-    assert annealed == pytest.approx([1e-3, 5.05e-4, 1e-5, 1e-5])
-    assert [rates.half_cosine(2.0, share, 1000) for share in (0.0, 0.5, 1.0)] == pytest.approx([2.0, 1.0, 0.0])
-    assert rates.half_cosine(2.0, 0.0, 99) == pytest.approx(0.5), "it rises at first"
-    optimizer = torch.optim.SGD([{"params": [torch.zeros(1)]}, {"params": [torch.zeros(2)]}], lr=1.0)
-    rates.set_learning_rate(optimizer, 0.1)
-    assert [group["lr"] for group in optimizer.param_groups] == [0.1, 0.1]
+def test_the_cpu_preset_leaves_the_teachers_actor_as_it_is(recipe: ModuleType, smoke: Any) -> None:
+    """And its history encoder; where they are trained on, as in ``smoke``, they do not stay."""
+    kept = {"behaviour": 0.0, "continuous": 0.0, "actor": False}
+    assert kept.items() <= vars(recipe.PRESETS["cpu"].imitation).items()
+    teacher = Artifact.load(smoke.teacher / "policy").state
+    run = recipe.train(replace(smoke, imitation=replace(smoke.imitation, **kept)))
+    state = Artifact.load(run / "policy").state
+    stays = [name for name in state if name.startswith(("actor.", "history_encoder."))]
+    assert stays and all(torch.equal(state[name], teacher[name]) for name in stays)
+    state = Artifact.load(recipe.train(replace(smoke, name="trained_on")) / "policy").state
+    assert not any(torch.equal(state[name], teacher[name]) for name in stays if name.endswith("weight"))
 
 
 def test_the_paper_preset_is_the_papers(module: Module) -> None:
