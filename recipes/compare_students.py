@@ -36,8 +36,8 @@ from agility_rl.record.plots import new_figure, save_figure
 from agility_rl.training import cli, metrics, run_folder
 
 CELLS_FILE = "cells.json"
-SETTINGS = ("course", "strength", "episodes", "robots", "episode_length", "seed")
-"""Options that all cells of a file share."""
+SETTINGS = ("strength", "episodes", "robots", "episode_length", "seed")
+"""Options that all cells of a file share, beside the course."""
 GROUPS = {True: "with BYOL", False: "without BYOL"}
 OF_TEACHER, HALVED = 0.9, 0.5
 """Targets of stage 4: share of the teacher's success, and of the loss of success under disturbance."""
@@ -71,17 +71,16 @@ class Config:
     """Folder of the results."""
 
 
-def measured_before(config: Config) -> dict[str, dict[str, Any]]:
+def measured_before(file: Path, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Cells of earlier calls with the same ``--output``: by weights and disturbance ``successes`` and ``obstacles``.
 
     Raises:
-        ValueError: if they are damaged, or were measured with other options than those asked for.
+        ValueError: if they are damaged, or were measured on another course or with other options.
     """
-    file = config.output / CELLS_FILE
     found = run_folder.read_json(file)
     if found is None:
         return {}
-    if other := [name for name in SETTINGS if found["settings"][name] != getattr(config, name)]:
+    if other := [name for name, value in settings.items() if found["settings"].get(name) != value]:
         raise ValueError(f"{file} was measured with other {', '.join(other)}; choose another --output, or remove it")
     return found["cells"]
 
@@ -196,11 +195,11 @@ def compare(config: Config, console: Console) -> dict[str, Any]:
         for name, student in zip(names, students, strict=True):
             if student.manifest["teacher"] != teacher.weights:
                 raise ValueError(f"{name} did not learn from the teacher of {config.teacher}; give the one it names")
-    cells = measured_before(config)
+    file = config.output / CELLS_FILE
+    settings = to_json({"course": course, **{name: getattr(config, name) for name in SETTINGS}})
+    cells = measured_before(file, settings)
     if cells:  # by other rules of the package, perhaps
-        file = config.output / CELLS_FILE
         console.print(f"{file}: what stands there is not measured again; remove it for that", highlight=False)
-    settings = {name: getattr(config, name) for name in SETTINGS}
     options = CourseConfig(
         episodes=config.episodes,
         robots=config.robots,
@@ -220,8 +219,9 @@ def compare(config: Config, console: Console) -> dict[str, Any]:
                 bar.remove_task(task)
                 successes = sum(episode.success for episode in episodes)
                 done[key] = to_json({"successes": successes, "obstacles": summarise(course, episodes)["obstacles"]})
-                written = {"format": "agility_rl.student_cells", "settings": settings, "cells": cells}
-                run_folder.write_json(config.output / CELLS_FILE, to_json(written))
+                run_folder.write_json(
+                    file, {"format": "agility_rl.student_cells", "settings": settings, "cells": cells}
+                )
             return done[key]
 
         def by_disturbance(decider: Decider) -> dict[str, dict[str, Any]]:

@@ -91,6 +91,8 @@ def test_students_are_compared_on_the_same_courses(
     assert len(json.loads(cells.read_text())["cells"]) == 3, "those of others stay"
     with pytest.raises(ValueError, match=r"cells\.json was measured with other episodes, seed; choose another"):
         recipe.compare(replace(config, episodes=1, seed=2), console)
+    with pytest.raises(ValueError, match=r"cells\.json was measured with other course; choose another"):
+        recipe.compare(replace(config, course="tunnel"), console)
     cells.write_text("{")
     with pytest.raises(ValueError, match=r"cells\.json is damaged: .*; make it again"):
         recipe.compare(config, console)
