@@ -174,9 +174,7 @@ def main(config: Config, console: Console) -> dict[str, list[dict[str, Any]]]:
     if config.preset not in bbc_presets.PRESETS:
         raise ValueError(f"--preset: expected one of {', '.join(bbc_presets.PRESETS)}, got {config.preset!r}")
     file = config.runs / "ablations.json"
-    rows: dict[str, list[dict[str, Any]]] = {}
-    if file.is_file():
-        rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
+    rows: dict[str, list[dict[str, Any]]] = (run_folder.read_json(file) or {"rows": {}})["rows"]
     for seed in config.seeds:
         for variant in config.variants:
             found = summary(train(variant, seed, config))

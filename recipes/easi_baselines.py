@@ -178,7 +178,7 @@ def make_problem(cfg: Config, log: Path, index: int, condition: Condition) -> Pr
 def compare_on(cfg: Config, folder: Path, index: int, name: str, console: Console) -> dict[str, Any]:
     """Results of one target, of a finished file or of what is still missing in it."""
     file = folder / f"target_{index:02d}.json"
-    result = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    result = run_folder.read_json(file) or {}
     missing = [method for method in cfg.methods if method not in result.get("methods", {})]
     if not missing:
         return result
