@@ -62,9 +62,10 @@ def test_states_come_and_commands_arrive(robot: LCMRobot, url: str) -> None:
     assert first.time < transport.read().time <= time.monotonic() and transport.other_commanders() == ()
     gains = torch.full((12,), 31.0), torch.full((12,), 2.0)
     transport.send(JointCommand(torch.arange(12.0), *gains))
-    assert until(lambda: robot.robot.model.actuator_gainprm[0, 0] == 31.0)
+    # The robot's thread sets the positions last.
+    assert until(lambda: robot.robot.data.ctrl.tolist() == list(range(12))), "our joints, in our order"
+    assert robot.robot.model.actuator_gainprm[0, 0] == 31.0
     assert robot.robot.model.actuator_biasprm[0, 2] == -2.0
-    assert robot.robot.data.ctrl.tolist() == list(range(12)), "our joints, in our order"
     assert transport.other_commanders() == () and robot.refused.count == transport.refused.count == 0
     transport.close()
     transport.close()
