@@ -30,6 +30,7 @@ from agility_rl.envs.randomization import Randomization
 from agility_rl.envs.resets import MaskedResets
 from agility_rl.envs.robots import Pushes, Robots
 from agility_rl.envs.scandots import NUM_SCANDOTS
+from agility_rl.envs.snapshots import put, taken
 from agility_rl.go2 import camera, features
 from agility_rl.simulation import Simulator, make_simulator
 from agility_rl.tensors import constant
@@ -366,6 +367,19 @@ class AgilityEnv(MaskedResets):
         self.pushes.phase = state_dict["push_phase"].clone()
         self.generator.set_state(state_dict["generator"])
         self._robot = self.robots.state(self.robots.action, self.decisions.commands)
+
+    def snapshot(self) -> TensorDict:
+        """Where every robot and its course are, and what both remember, ``[N]``, for :meth:`restore`."""
+        return taken(self.state_dict(), self.num_robots)
+
+    def restore(self, rows: Tensor, snapshot: TensorDictBase) -> TensorDict:
+        """Let robots ``rows``, int64 ``[M]``, go on from snapshots ``[M]``, their own or others'.
+
+        Returns:
+            What all ``[N]`` robots observe then.
+        """
+        self.load_state_dict(put(self.state_dict(), rows, snapshot))
+        return self._observe(self._outcome()).exclude("reward")
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Release the simulator's threads and memory."""

@@ -92,6 +92,14 @@ class Rollout:
         self._storage["next", "state_value"][-1] += final.masked_fill(self._last_done, 0.0)
         return self._storage
 
+    def go_on_from(self, rows: Tensor, observed: TensorDictBase) -> None:
+        """Let the next call begin, for the robots ``rows`` (int64 ``[M]``), with what is observed now, ``[N]``."""
+        assert self.carrier is not None
+        known = self.carrier.keys(True, True)
+        for key in observed.keys(True, True):
+            if key in known:
+                self.carrier[key] = self.carrier[key].index_copy(0, rows, observed[key][rows])
+
     def state_dict(self) -> dict[str, Any]:
         """The observations from which the next call goes on, as nested dicts of tensors."""
         return {} if self.carrier is None else {"carrier": self.carrier.clone().to_dict()}

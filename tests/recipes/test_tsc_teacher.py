@@ -6,20 +6,26 @@ import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from agility_rl.behaviours import BEHAVIOURS, command_bounds, commands_from_parameters
 from agility_rl.deploy.artifact import Artifact, ArtifactError
+from agility_rl.envs import AgilityEnv
+from agility_rl.envs.agility_state import AgilityState
+from agility_rl.envs.agility_terminations import AGILITY_TERMINATIONS
 from agility_rl.envs.misjudgement import LASTING
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.modules import Teacher
 from agility_rl.record.mcap_logger import read_scalars
+from agility_rl.training import rewind
 
 Module = Callable[[str], ModuleType]
 
@@ -61,6 +67,43 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smok
     assert read_scalars(whole)["kl_continuous"][1][0].abs() < 1e-3, "the first iteration leaves the policy as it is"
     for name in ("reward/task", "loss_critic", "use/jump"):
         assert torch.equal(read_scalars(whole)[name][1], read_scalars(halves)[name][1]), name
+
+
+def fast(state: AgilityState, limit: float) -> Tensor:
+    """A failure: to be faster than that [m/s]."""
+    return state.velocity.norm(dim=-1) > limit
+
+
+def test_a_run_that_practises_what_failed_is_resumed_bit_for_bit(
+    recipe: ModuleType, smoke: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Snapshots are of this run alone: those that are kept are in its checkpoints."""
+    monkeypatch.setattr(rewind, "LEAST", 1)
+    monkeypatch.setattr(rewind, "BACK", (0.0, 0.2))
+    kicked = partial(fast, limit=0.3)  # robots of an untrained controller stand, whatever happens to them
+    monkeypatch.setitem(AGILITY_TERMINATIONS, "sunk", kicked)  # type: ignore[arg-type]
+    begun = []
+    restore = AgilityEnv.restore
+
+    def watched(env: AgilityEnv, rows: Tensor, snapshot: TensorDictBase) -> TensorDict:
+        begun.append(rows.tolist())
+        return restore(env, rows, snapshot)
+
+    monkeypatch.setattr(AgilityEnv, "restore", watched)
+    smoke = replace(
+        smoke,
+        ppo=replace(smoke.ppo, steps=30),
+        env=replace(smoke.env, push_interval=0.4),
+        curriculum=replace(smoke.curriculum, rewound=0.25),
+    )
+    whole = recipe.train(replace(smoke, name="whole", iterations=4))
+    assert begun and begun[0] == [0, 1], "two of eight"
+    count = len(begun)
+    halves = recipe.train(replace(smoke, name="halves", iterations=2))
+    recipe.train(replace(smoke, resume=halves, iterations=4))
+    assert len(begun) == 2 * count
+    one, other = (Artifact.load(run / "policy").state for run in (whole, halves))
+    assert not [name for name in one if not torch.equal(one[name], other[name])]
 
 
 @pytest.mark.slow
@@ -235,6 +278,7 @@ def test_the_curriculum_by_hand(module: Module) -> None:
         (("--env.course", "nowhere.toml"), "nowhere.toml: cannot be read"),
         (("--behaviours", "trot", "gallop"), "unknown gallop"),
         (("--env.fastest-canter", "0.5"), "fastest canter: expected more than 0.8 and at most 5 m/s, got 0.5"),
+        (("--curriculum.rewound", "1"), "--curriculum.rewound: expected a share from 0 to less than 1, got 1.0"),
         (("--bbc", "nowhere"), "nowhere"),
         (("--env.num-robot", "3"), "did you mean --env.num-robots"),
     ],

@@ -54,6 +54,20 @@ def rollout(env: LocomotionEnv, steps: int = T) -> Rollout:
     return Rollout(env, steps, keep=KEEP, keep_next=KEEP_NEXT, value=value)
 
 
+def test_some_robots_go_on_with_what_is_observed_now(build: Build) -> None:
+    env = build()
+    run = rollout(env, 2)
+    run.collect(policy)
+    assert run.carrier is not None
+    before, observed = run.carrier.clone(), env.step(policy(env.reset()))["next"].exclude("reward")
+    run.go_on_from(torch.tensor([2, 0]), observed)
+    for name in (keys.PROPRIOCEPTION, keys.HISTORY):
+        assert not torch.equal(before[name][0], observed[name][0])
+        assert torch.equal(run.carrier[name][[0, 2]], observed[name][[0, 2]])
+        assert torch.equal(run.carrier[name][[1, 3]], before[name][[1, 3]])
+    assert set(run.carrier.keys(True)) == set(before.keys(True))
+
+
 def one_by_one(env: LocomotionEnv, steps: int) -> list[TensorDict]:
     """The same experience by plain steps and resets, with every observation kept twice."""
     observation, rows = env.reset(), []
