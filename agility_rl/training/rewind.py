@@ -41,8 +41,8 @@ class Rewind:
 
     A policy that rarely fails learns little from its failures: few of the steps of a roll-out lead to one. Snapshots
     are taken in every roll-out; of each robot that fails in it, the one is kept that is nearest to a moment drawn from
-    :data:`BACK` before, of the same episode. The first ``num_rewound`` robots begin the next roll-out from kept
-    snapshots, and the others go on; only their failures are kept, so that what cannot be averted does not pile up.
+    :data:`BACK` before, of the same episode and roll-out. The first ``num_rewound`` robots begin the next roll-out from
+    kept snapshots, and the others go on; only their failures are kept, so that what cannot be averted does not pile up.
 
     Source: ours; to begin from states that matter: Salimans and Chen 2018 (arXiv:1812.03381), Ecoffet et al. 2021
     (doi:10.1038/s41586-020-03157-9).
