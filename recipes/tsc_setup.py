@@ -135,7 +135,7 @@ def make_rewind(env: AgilityEnv, share: float, seeds: Seeds) -> Rewind | None:
     if not 0.0 <= share < 1.0:
         raise ValueError(f"--curriculum.rewound: expected a share from 0 to less than 1, got {share}")
     count = round(share * env.num_robots)
-    return Rewind(env, count, env.dt * env.decision_steps, seeds.generator("rewind")) if share else None
+    return Rewind(env, count, env.dt * env.decision_steps, seeds.generator("rewind")) if count else None
 
 
 def make_env(

@@ -376,7 +376,10 @@ class AgilityEnv(MaskedResets):
         """Let robots ``rows``, int64 ``[M]``, go on from snapshots ``[M]``, their own or others'.
 
         Returns:
-            What all ``[N]`` robots observe then.
+            What all ``[N]`` robots observe then; the others are where they were.
+
+        Raises:
+            ValueError: if the snapshots are of an environment with other options.
         """
         self.load_state_dict(put(self.state_dict(), rows, snapshot))
         return self._observe(self._outcome()).exclude("reward")

@@ -34,6 +34,9 @@ def put(state: Mapping[str, Any], rows: Tensor, snapshot: TensorDictBase) -> dic
 
     Source: ours.
 
+    Raises:
+        ValueError: if the snapshot is of an environment that remembers something else.
+
     Example:
         >>> import torch
         >>> other = TensorDict({"leg": torch.tensor([7])}, [1])
@@ -42,10 +45,12 @@ def put(state: Mapping[str, Any], rows: Tensor, snapshot: TensorDictBase) -> dic
     """
 
     def changed(name: str, value: Any) -> Any:
-        if name in SHARED:
+        if name in SHARED or (isinstance(value, Mapping) and not value):
             return value
+        if name not in snapshot:
+            raise ValueError(f"the snapshot holds no {name!r}: it is of an environment with other options")
         if isinstance(value, Mapping):
-            return put(value, rows, snapshot[name]) if value else {}
+            return put(value, rows, snapshot[name])
         return value.index_copy(0, rows, snapshot[name])
 
     return {name: changed(name, value) for name, value in state.items()}

@@ -54,7 +54,7 @@ class Rewind:
         generator: source of randomness; where it is, the snapshots are.
 
     Raises:
-        ValueError: if all robots would begin so.
+        ValueError: if all robots would begin so, or none.
 
     Attributes:
         kept: snapshots ``[K]``; ``None`` before the first failure.
@@ -73,8 +73,8 @@ class Rewind:
     """
 
     def __init__(self, env: Snapshots, num_rewound: int, dt: float, generator: torch.Generator) -> None:
-        if not 0 <= num_rewound < env.num_robots:
-            raise ValueError(f"expected 0 to {env.num_robots - 1} of {env.num_robots} robots, got {num_rewound}")
+        if not 0 < num_rewound < env.num_robots:
+            raise ValueError(f"expected 1 to {env.num_robots - 1} of {env.num_robots} robots, got {num_rewound}")
         self.env, self.dt, self.generator = env, dt, generator
         self.rows = torch.arange(num_rewound, device=generator.device)
         self.kept: TensorDictBase | None = None
@@ -87,9 +87,9 @@ class Rewind:
 
     def begin(self, rollout: Rollout) -> None:
         """Put the robots that are rewound where others were, before the next roll-out."""
-        if self.kept is None or len(self.kept) < LEAST or not len(self.rows):
+        if self.kept is None or len(self.kept) < LEAST:
             return
-        shape, device = (len(self.rows),), self.generator.device
+        shape, device = self.rows.shape, self.rows.device
         chosen = torch.randint(len(self.kept), shape, generator=self.generator, device=device)
         rollout.go_on_from(self.rows, self.env.restore(self.rows, self.kept[chosen]))
 

@@ -31,6 +31,12 @@ def test_what_all_share_stays_where_it_is() -> None:
     assert after["arena"]["start_weights"].tolist() == after["generator"].tolist() == [10.0, 11.0, 12.0]
 
 
+def test_a_snapshot_of_something_else_is_refused() -> None:
+    snapshot = taken({"arena": {"leg": torch.arange(3)}}, 3)
+    with pytest.raises(ValueError, match="the snapshot holds no 'simulator': it is of an environment with other"):
+        put({"simulator": {"state": torch.zeros(3, 1)}}, torch.tensor([0]), snapshot)
+
+
 def test_a_snapshot_is_not_changed_by_what_it_is_put_into() -> None:
     snapshot, rows = taken(state(0.0), 3), torch.tensor([0, 1, 2])
     after = put(state(10.0), rows, snapshot)
