@@ -49,6 +49,9 @@ class EnvConfig(RobotsConfig):
     fastest_canter: float = FASTEST_CANTER
     """What the forward speed of a commanded canter ends at [m/s]: Table S2's 2.0, or faster (ours), which the
     controller has not practised. Its students and whoever runs it command the same."""
+    rewound: float = 0.0
+    """Share of the robots that begin every roll-out where others were 0.8 to 2.8 s before they failed, or when the
+    roll-out began (ours)."""
     misjudgement: float = 0.0
     """Factor on errors of the place, the directions, the obstacle and the terrain that it is told, as a student's; 0:
     all is true (ours)."""
@@ -184,8 +187,6 @@ class CurriculumConfig:
     """Obstacles of an episode at the start; one more whenever the difficulty is full. 6 or more: all at once."""
     practice: float = 1.0
     """How much more often an episode starts before an obstacle that fails: weight 1 + this * failure / success."""
-    rewound: float = 0.0
-    """Share of the robots that begin every roll-out where others were 0.8 to 2.8 s before they failed (ours)."""
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,7 @@ def build(cfg: Config) -> Components:
             keep=[keys.ESTIMATE],
             keep_in_minibatches=[INFERRED],
         ),
-        rewind=make_rewind(env, cfg.curriculum.rewound, seeds),
+        rewind=make_rewind(env, cfg.env.rewound, seeds),
         adaptation_loss=AdaptationLoss(teacher.history_encoder, teacher.privileged_encoder),
         privileged_loss=privileged_loss(teacher.privileged_encoder),
         adaptation_optimizer=torch.optim.Adam(
@@ -133,7 +133,7 @@ def make_rewind(env: AgilityEnv, share: float, seeds: Seeds) -> Rewind | None:
         ValueError: if it is no share, or leaves nobody who goes his own way.
     """
     if not 0.0 <= share < 1.0:
-        raise ValueError(f"--curriculum.rewound: expected a share from 0 to less than 1, got {share}")
+        raise ValueError(f"--env.rewound: expected a share from 0 to less than 1, got {share}")
     count = round(share * env.num_robots)
     return Rewind(env, count, env.dt * env.decision_steps, seeds.generator("rewind")) if count else None
 

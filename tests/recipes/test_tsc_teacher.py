@@ -93,8 +93,7 @@ def test_a_run_that_practises_what_failed_is_resumed_bit_for_bit(
     smoke = replace(
         smoke,
         ppo=replace(smoke.ppo, steps=30),
-        env=replace(smoke.env, push_interval=0.4),
-        curriculum=replace(smoke.curriculum, rewound=0.25),
+        env=replace(smoke.env, push_interval=0.4, rewound=0.25),
     )
     whole = recipe.train(replace(smoke, name="whole", iterations=4))
     assert begun and begun[0] == [0, 1], "two of eight"
@@ -278,7 +277,7 @@ def test_the_curriculum_by_hand(module: Module) -> None:
         (("--env.course", "nowhere.toml"), "nowhere.toml: cannot be read"),
         (("--behaviours", "trot", "gallop"), "unknown gallop"),
         (("--env.fastest-canter", "0.5"), "fastest canter: expected more than 0.8 and at most 5 m/s, got 0.5"),
-        (("--curriculum.rewound", "1"), "--curriculum.rewound: expected a share from 0 to less than 1, got 1.0"),
+        (("--env.rewound", "1"), "--env.rewound: expected a share from 0 to less than 1, got 1.0"),
         (("--bbc", "nowhere"), "nowhere"),
         (("--env.num-robot", "3"), "did you mean --env.num-robots"),
     ],
