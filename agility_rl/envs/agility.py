@@ -30,7 +30,7 @@ from agility_rl.envs.randomization import Randomization
 from agility_rl.envs.resets import MaskedResets
 from agility_rl.envs.robots import Pushes, Robots
 from agility_rl.envs.scandots import NUM_SCANDOTS
-from agility_rl.envs.snapshots import put, taken
+from agility_rl.envs.snapshots import per_robot, with_rows
 from agility_rl.go2 import camera, features
 from agility_rl.simulation import Simulator, make_simulator
 from agility_rl.tensors import constant
@@ -370,7 +370,7 @@ class AgilityEnv(MaskedResets):
 
     def snapshot(self) -> TensorDict:
         """Where every robot and its course are, and what both remember, ``[N]``, for :meth:`restore`."""
-        return taken(self.state_dict(), self.num_robots)
+        return per_robot(self.state_dict(), self.num_robots)
 
     def restore(self, rows: Tensor, snapshot: TensorDictBase) -> TensorDict:
         """Let robots ``rows``, int64 ``[M]``, go on from snapshots ``[M]``, their own or others'.
@@ -381,7 +381,7 @@ class AgilityEnv(MaskedResets):
         Raises:
             ValueError: if the snapshots are of an environment with other options.
         """
-        self.load_state_dict(put(self.state_dict(), rows, snapshot))
+        self.load_state_dict(with_rows(self.state_dict(), rows, snapshot))
         return self._observe(self._outcome()).exclude("reward")
 
     def close(self, *, raise_if_closed: bool = True) -> None:

@@ -58,6 +58,8 @@ class Rewind:
 
     Attributes:
         kept: snapshots ``[K]``; ``None`` before the first failure.
+        rows: the robots that begin so, int64 ``[R]``.
+        apart: steps between two snapshots of a roll-out.
 
     Example:
         >>> from agility_rl.envs import AgilityEnv
@@ -76,14 +78,10 @@ class Rewind:
         if not 0 < num_rewound < env.num_robots:
             raise ValueError(f"expected 1 to {env.num_robots - 1} of {env.num_robots} robots, got {num_rewound}")
         self.env, self.dt, self.generator = env, dt, generator
+        self.apart = max(1, round(APART / dt))
         self.rows = torch.arange(num_rewound, device=generator.device)
         self.kept: TensorDictBase | None = None
         self._taken: list[TensorDict] = []
-
-    @property
-    def apart(self) -> int:
-        """Steps between two snapshots."""
-        return max(1, round(APART / self.dt))
 
     def begin(self, rollout: Rollout) -> None:
         """Put the robots that are rewound where others were, before the next roll-out."""

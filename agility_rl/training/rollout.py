@@ -93,8 +93,13 @@ class Rollout:
         return self._storage
 
     def go_on_from(self, rows: Tensor, observed: TensorDictBase) -> None:
-        """Let the next call begin, for the robots ``rows`` (int64 ``[M]``), with what is observed now, ``[N]``."""
-        assert self.carrier is not None
+        """Let the next call begin, for the robots ``rows`` (int64 ``[M]``), with what is observed now, ``[N]``.
+
+        Raises:
+            ValueError: if nothing was collected yet: then the next call begins with a reset.
+        """
+        if self.carrier is None:
+            raise ValueError("robots cannot go on before the first roll-out; collect one")
         known = self.carrier.keys(True, True)
         for key in observed.keys(True, True):
             if key in known:

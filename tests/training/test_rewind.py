@@ -1,4 +1,4 @@
-"""Robots that begin where others were shortly before they failed, in the real environment."""
+"""Robots that begin where others were shortly before they failed: which moments, by hand; and in the engine."""
 
 from __future__ import annotations
 
@@ -74,8 +74,9 @@ def test_nobody_begins_elsewhere_before_enough_has_failed(
     monkeypatch.setattr(rewind, "CAPACITY", 4)
     clock = Clock()
     one = Rewind(clock, 2, DT, generator)
-    rollout = Rollout(clock_env := AgilityEnv(N, stand, simulator_options={"num_threads": 1}), 1, **KEPT)
-    rollout.collect(clock_env.rand_action)
+    course = AgilityEnv(N, stand, simulator_options={"num_threads": 1})
+    rollout = Rollout(course, 1, **KEPT)
+    rollout.collect(course.rand_action)
     for robot in (3, 4, 5, 3, 4):
         watched(one, clock, 100)
         failed = ends(100, (80, robot))
@@ -84,7 +85,7 @@ def test_nobody_begins_elsewhere_before_enough_has_failed(
         assert one.kept is not None and clock.placed.is_empty() == (len(one.kept) < 3)
     assert one.kept["robot"].tolist() == [4, 5, 3, 4], "the newest"
     assert clock.placed["rows"].tolist() == [0, 1] and set(clock.placed["from", "robot"].tolist()) <= {3, 4, 5}
-    clock_env.close()
+    course.close()
 
 
 def stand(td: TensorDictBase) -> TensorDictBase:

@@ -57,6 +57,8 @@ def rollout(env: LocomotionEnv, steps: int = T) -> Rollout:
 def test_some_robots_go_on_with_what_is_observed_now(build: Build) -> None:
     env = build()
     run = rollout(env, 2)
+    with pytest.raises(ValueError, match="cannot go on before the first roll-out"):
+        run.go_on_from(torch.tensor([0]), env.reset())
     run.collect(policy)
     assert run.carrier is not None
     before, observed = run.carrier.clone(), env.step(policy(env.reset()))["next"].exclude("reward")
