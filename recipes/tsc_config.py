@@ -49,9 +49,6 @@ class EnvConfig(RobotsConfig):
     fastest_canter: float = FASTEST_CANTER
     """What the forward speed of a commanded canter ends at [m/s]: Table S2's 2.0, or faster (ours), which the
     controller has not practised. Its students and whoever runs it command the same."""
-    rewound: float = 0.0
-    """Share of the robots that begin every roll-out where others were 0.8 to 2.8 s before they failed, or when the
-    roll-out began (ours)."""
     misjudgement: float = 0.0
     """Factor on errors of the place, the directions, the obstacle and the terrain that it is told, as a student's; 0:
     all is true (ours)."""
@@ -61,6 +58,9 @@ class EnvConfig(RobotsConfig):
 class PPOConfig:
     steps: int = 24
     """Decisions of a roll-out (method notes, section 5.9)."""
+    rewound: float = 0.0
+    """Share of the robots that begin every roll-out where others were 0.8 to 2.8 s before they failed, or when the
+    roll-out began (ours)."""
     epochs: int = 5
     """Passes over a roll-out (method notes, section 3.7)."""
     minibatches: int = 4

@@ -22,6 +22,7 @@ from agility_rl.modules import Critic, HybridActor
 from agility_rl.training.exploration import LastingNoise, Policy
 from agility_rl.training.ppo import FirstGroup, PPOUpdate
 from agility_rl.training.precision import hidden_precision
+from agility_rl.training.rewind import Rewind
 from agility_rl.training.rollout import Rollout
 from agility_rl.training.seeding import Seeds
 
@@ -39,6 +40,7 @@ class Learner:
     critic: Critic
     optimizer: torch.optim.Optimizer
     rollout: Rollout
+    rewind: Rewind | None
     noise: LastingNoise | None
     advantage: GAE
     update: PPOUpdate
@@ -51,11 +53,23 @@ class Learner:
     @property
     def own(self) -> dict[str, Any]:
         """What each process has for itself."""
-        return {"rollout": self.rollout} | ({} if self.noise is None else {"noise": self.noise})
+        parts = {"rollout": self.rollout, "rewind": self.rewind, "noise": self.noise}
+        return {name: part for name, part in parts.items() if part is not None}
+
+    @property
+    def num_rewound(self) -> int:
+        """How many robots, the first ones, begin roll-outs where others failed."""
+        return 0 if self.rewind is None else len(self.rewind.rows)
 
     def collect(self, policy: Policy) -> TensorDictBase:
         """Experience ``[T, N]`` of a policy that tries something else now and then."""
-        return self.rollout.collect(policy if self.noise is None else self.noise.around(policy))
+        policy = policy if self.noise is None else self.noise.around(policy)
+        if self.rewind is None:
+            return self.rollout.collect(policy)
+        self.rewind.begin(self.rollout)
+        batch = self.rollout.collect(self.rewind.watching(policy))
+        self.rewind.remember(batch["next", "terminated"], batch["next", "done"])
+        return batch
 
 
 def make_learner(
@@ -66,6 +80,7 @@ def make_learner(
     seeds: Seeds,
     *,
     stepped: EnvBase | None = None,
+    carried: Sequence[NestedKey] = (),
     keep: Sequence[NestedKey] = (),
     keep_in_minibatches: Sequence[NestedKey] = (),
 ) -> Learner:
@@ -78,9 +93,15 @@ def make_learner(
         actor: its last part, whose deviations have a floor.
         seeds: sources of randomness.
         stepped: what roll-outs step, if that is more than ``env``.
+        carried: entries in which the policy carries what it remembers.
         keep: entries that roll-outs keep beside those that every learner needs.
         keep_in_minibatches: entries that the update's ``extra`` reads.
+
+    Raises:
+        ValueError: if no share of the robots shall begin where others failed, or nobody else.
     """
+    if not 0.0 <= ppo.rewound < 1.0:
+        raise ValueError(f"--ppo.rewound: expected a share from 0 to less than 1, got {ppo.rewound}")
     width = sum(env.observation_spec[key].shape[1:].numel() for key in OBSERVED)
     critic = Critic(width, in_keys=list(OBSERVED), hidden=ppo.hidden).to(env.device)
     groups: list[dict[str, Any]] = [{"params": list(trained.parameters())}]
@@ -107,9 +128,10 @@ def make_learner(
     schedule = None
     if ppo.desired_kl is not None:
         schedule = KLAdaptiveLR(FirstGroup(optimizer), ppo.desired_kl, max_lr=ppo.max_learning_rate)
-    noise = None
+    decision_dt, noise, rewind = env.dt * env.decision_steps, None, None
+    if count := round(ppo.rewound * env.num_robots):
+        rewind = Rewind(env, count, decision_dt, seeds.generator("rewind"), carried)
     if ppo.noise_seconds is not None:
-        decision_dt = env.dt * env.decision_steps
         noise = LastingNoise(
             ppo.noise_seconds, decision_dt, seeds.generator("exploration"), (keys.ACTION, keys.PARAMETERS)
         )
@@ -126,6 +148,7 @@ def make_learner(
             value=lambda observation: critic(observation.select(*OBSERVED))["state_value"],
             compile=ppo.compile,
         ),
+        rewind=rewind,
         noise=noise,
         advantage=GAE(gamma=ppo.gamma, lmbda=ppo.lmbda, value_network=None, time_dim=0),
         update=PPOUpdate(

@@ -193,6 +193,7 @@ def build(cfg: Config) -> Components:
             student.actor,
             seeds,
             stepped=TransformedEnv(env, Compose(InitTracker(), memory)),
+            carried=(NEXT_HIDDEN, "is_init"),
             keep=student.actor.in_keys,
         ),
         policy=TensorDictSequential(recall, *student.policy(assisted=True)),
@@ -212,7 +213,7 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     set_course(parts.env, parts.curriculum)
     batch = parts.learner.collect(parts.policy)
     lap("collect")
-    metrics: dict[str, Any] = judge(parts.env, parts.curriculum, batch)
+    metrics: dict[str, Any] = judge(parts.env, parts.curriculum, batch[:, parts.learner.num_rewound :])
     metrics |= add_rewards(None, cfg.reward.task, batch)
     value_finished(batch, cfg.reward.finished)
     with torch.no_grad():

@@ -32,7 +32,6 @@ from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import constants, features
 from agility_rl.losses import AdaptationLoss, ImitationReward
 from agility_rl.modules import Discriminator, FeatureNormalizer, Teacher
-from agility_rl.training.rewind import Rewind
 from agility_rl.training.seeding import Seeds, seed_everything
 
 
@@ -47,7 +46,6 @@ class Components:
     imitation: ImitationReward | None
     curriculum: Curriculum
     learner: Learner
-    rewind: Rewind | None
     adaptation_loss: AdaptationLoss
     privileged_loss: AdaptationLoss
     adaptation_optimizer: torch.optim.Optimizer
@@ -68,8 +66,7 @@ class Components:
     @property
     def own(self) -> dict[str, Any]:
         """What each process has for itself."""
-        own = {"seeds": self.seeds, "env": self.env} | self.learner.own
-        return own if self.rewind is None else own | {"rewind": self.rewind}
+        return {"seeds": self.seeds, "env": self.env} | self.learner.own
 
 
 def build(cfg: Config) -> Components:
@@ -116,7 +113,6 @@ def build(cfg: Config) -> Components:
             keep=[keys.ESTIMATE],
             keep_in_minibatches=[INFERRED],
         ),
-        rewind=make_rewind(env, cfg.env.rewound, seeds),
         adaptation_loss=AdaptationLoss(teacher.history_encoder, teacher.privileged_encoder),
         privileged_loss=privileged_loss(teacher.privileged_encoder),
         adaptation_optimizer=torch.optim.Adam(
@@ -124,18 +120,6 @@ def build(cfg: Config) -> Components:
         ),
         bbc=controller,
     )
-
-
-def make_rewind(env: AgilityEnv, share: float, seeds: Seeds) -> Rewind | None:
-    """What lets a share of the robots practise what fails, if any shall.
-
-    Raises:
-        ValueError: if it is no share, or leaves nobody who goes his own way.
-    """
-    if not 0.0 <= share < 1.0:
-        raise ValueError(f"--env.rewound: expected a share from 0 to less than 1, got {share}")
-    count = round(share * env.num_robots)
-    return Rewind(env, count, env.dt * env.decision_steps, seeds.generator("rewind")) if count else None
 
 
 def make_env(

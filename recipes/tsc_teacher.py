@@ -38,7 +38,6 @@ from agility_rl.losses import functional
 from agility_rl.modules.teacher import rescale_canter, widen_place
 from agility_rl.training import cli
 from agility_rl.training.compilation import compiled
-from agility_rl.training.exploration import Policy
 
 HEADLINE: tuple[str, ...] = (
     "time/minutes",
@@ -59,10 +58,9 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
     with_history = cfg.adaptation.every > 0 and iteration % cfg.adaptation.every == cfg.adaptation.every - 1
     # Compiled, the history encoder's convolutions would round otherwise in a run that is resumed.
     taught = compiled(parts.teacher.privileged_policy(), cfg.ppo.compile)
-    batch = collect(parts, parts.teacher.deployable_policy() if with_history else taught)
+    batch = parts.learner.collect(parts.teacher.deployable_policy() if with_history else taught)
     lap("collect")
-    rewound = 0 if parts.rewind is None else len(parts.rewind.rows)
-    metrics: dict[str, Any] = judge(parts.env, parts.curriculum, batch[:, rewound:])
+    metrics: dict[str, Any] = judge(parts.env, parts.curriculum, batch[:, parts.learner.num_rewound :])
     metrics |= add_rewards(parts.imitation, cfg.reward.task, batch)
     value_finished(batch, cfg.reward.finished)
     weight = functional.linear_ramp(iteration, *cfg.adaptation.privileged_ramp, cfg.adaptation.privileged)
@@ -85,16 +83,6 @@ def iterate(parts: Components, cfg: Config, iteration: int) -> dict[str, float]:
         parts.averaged.update_parameters(parts.teacher)
     metrics |= what_happened(batch, parts.teacher.actor)
     return {name: float(value) for name, value in metrics.items()} | lap.metrics
-
-
-def collect(parts: Components, policy: Policy) -> TensorDictBase:
-    """Experience ``[T, N]`` of a policy, in which the first robots practise what fails, if any shall."""
-    if parts.rewind is None:
-        return parts.learner.collect(policy)
-    parts.rewind.begin(parts.learner.rollout)
-    batch = parts.learner.collect(parts.rewind.watching(policy))
-    parts.rewind.remember(batch["next", "terminated"], batch["next", "done"])
-    return batch
 
 
 def begin(parts: Components, cfg: Config) -> None:

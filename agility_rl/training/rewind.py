@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 from agility_rl.training.exploration import Policy
@@ -52,6 +52,7 @@ class Rewind:
         num_rewound: how many begin so.
         dt: time between two decisions [s].
         generator: source of randomness; where it is, the snapshots are.
+        carried: entries in which the policy carries what it remembers from step to step; snapshots hold them too.
 
     Raises:
         ValueError: if all robots would begin so, or none.
@@ -74,10 +75,17 @@ class Rewind:
         >>> env.close()
     """
 
-    def __init__(self, env: Snapshots, num_rewound: int, dt: float, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        env: Snapshots,
+        num_rewound: int,
+        dt: float,
+        generator: torch.Generator,
+        carried: Sequence[NestedKey] = (),
+    ) -> None:
         if not 0 < num_rewound < env.num_robots:
             raise ValueError(f"expected 1 to {env.num_robots - 1} of {env.num_robots} robots, got {num_rewound}")
-        self.env, self.dt, self.generator = env, dt, generator
+        self.env, self.dt, self.generator, self.carried = env, dt, generator, list(carried)
         self.apart = max(1, round(APART / dt))
         self.rows = torch.arange(num_rewound, device=generator.device)
         self.kept: TensorDictBase | None = None
@@ -89,7 +97,8 @@ class Rewind:
             return
         shape, device = self.rows.shape, self.rows.device
         chosen = torch.randint(len(self.kept), shape, generator=self.generator, device=device)
-        rollout.go_on_from(self.rows, self.env.restore(self.rows, self.kept[chosen]))
+        begun = self.kept[chosen]
+        rollout.go_on_from(self.rows, self.env.restore(self.rows, begun)[self.rows].update(begun["carried"]))
 
     def watching(self, policy: Policy) -> Policy:
         """The same policy; snapshots are taken while it acts in one roll-out."""
@@ -98,7 +107,7 @@ class Rewind:
         def act(td: TensorDictBase) -> TensorDictBase:
             nonlocal step
             if step % self.apart == 0:
-                self._taken.append(self.env.snapshot())
+                self._taken.append(self.env.snapshot().set("carried", td.select(*self.carried)))
             step += 1
             return policy(td)
 

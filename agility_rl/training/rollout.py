@@ -93,7 +93,7 @@ class Rollout:
         return self._storage
 
     def go_on_from(self, rows: Tensor, observed: TensorDictBase) -> None:
-        """Let the next call begin, for the robots ``rows`` (int64 ``[M]``), with what is observed now, ``[N]``.
+        """Let the next call begin, for the robots ``rows`` (int64 ``[M]``), with what they observe, ``[M]``.
 
         Raises:
             ValueError: if nothing was collected yet: then the next call begins with a reset.
@@ -103,7 +103,7 @@ class Rollout:
         known = self.carrier.keys(True, True)
         for key in observed.keys(True, True):
             if key in known:
-                self.carrier[key] = self.carrier[key].index_copy(0, rows, observed[key][rows])
+                self.carrier[key] = self.carrier[key].index_copy(0, rows, observed[key])
 
     def state_dict(self) -> dict[str, Any]:
         """The observations from which the next call goes on, as nested dicts of tensors."""

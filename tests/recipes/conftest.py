@@ -13,13 +13,17 @@ from types import ModuleType
 
 import pytest
 import torch
+from torch import Tensor
 
 from agility_rl.deploy.artifact import Artifact, build_manifest
 from agility_rl.deploy.task import describe_camera
+from agility_rl.envs.agility_state import AgilityState
+from agility_rl.envs.agility_terminations import AGILITY_TERMINATIONS
 from agility_rl.envs.course_presets import COURSES
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.go2 import features
 from agility_rl.modules import BasicBehaviourController, RecurrentStudent, Teacher
+from agility_rl.training import rewind
 
 
 @pytest.fixture
@@ -68,6 +72,19 @@ def make_student(untrained_teacher: Path, tmp_path: Path, module: Callable[[str]
         return tmp_path / name
 
     return make
+
+
+def kicked(state: AgilityState) -> Tensor:
+    """To be faster than 0.3 m/s, a failure of robots that stand as those of an untrained controller do."""
+    return state.velocity.norm(dim=-1) > 0.3
+
+
+@pytest.fixture
+def failures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Robots that are pushed fail, and from the first of them on others begin at most 0.2 s before."""
+    monkeypatch.setattr(rewind, "LEAST", 1)
+    monkeypatch.setattr(rewind, "BACK", (0.0, 0.2))
+    monkeypatch.setitem(AGILITY_TERMINATIONS, "sunk", kicked)  # type: ignore[arg-type]
 
 
 @pytest.fixture

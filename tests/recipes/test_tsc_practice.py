@@ -72,6 +72,37 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smok
         recipe.train(replace(smoke, resume=halves, iterations=5))
 
 
+@pytest.mark.usefixtures("failures")
+def test_where_it_failed_it_goes_on_with_what_it_remembered(recipe: ModuleType, smoke: Any) -> None:
+    """Images, memory and course are those of the robot that failed later, and so is what is perceived."""
+    smoke = replace(
+        smoke,
+        ppo=replace(smoke.ppo, steps=30, rewound=0.25),
+        env=replace(smoke.env, push_interval=0.4, command_noise=(1.0, 1.0)),
+    )
+    parts = recipe.build(smoke)
+    rollout, one = parts.learner.rollout, parts.learner.rewind
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        batch = parts.learner.collect(parts.policy).clone()
+    assert one.kept is not None and rollout.carrier is not None
+    one.begin(rollout)
+    begun = rollout.carrier[:1].clone()
+    moments = (batch[keys.HISTORY] == begun[keys.HISTORY]).flatten(2).all(-1).nonzero()
+    step, robot = moments[0].tolist()
+    assert step % one.apart == 0 and robot > 0 and not torch.equal(batch[keys.HISTORY][step, 0], begun[keys.HISTORY][0])
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        seen = parts.policy(rollout.carrier.clone())
+    for key in (PERCEIVED_PLACE, keys.TERRAIN_LATENT, "loc"):
+        torch.testing.assert_close(seen[key][0], batch[key][step, robot])
+    parts.env.close()
+
+    whole = recipe.train(replace(smoke, name="whole", iterations=4))
+    halves = recipe.train(replace(smoke, name="halves", iterations=2))
+    recipe.train(replace(smoke, resume=halves, iterations=4))
+    before, after = (Artifact.load(run / "policy").state for run in (whole, halves))
+    assert not [name for name in before if not torch.equal(before[name], after[name])]
+
+
 def test_its_deviations_are_those_of_its_options(recipe: ModuleType, smoke: Any) -> None:
     cfg = replace(smoke, ppo=replace(smoke.ppo, min_std=0.03, initial_std=0.05))
     parts = recipe.build(cfg)

@@ -18,13 +18,10 @@ from torch import Tensor
 from agility_rl.behaviours import BEHAVIOURS, command_bounds, commands_from_parameters
 from agility_rl.deploy.artifact import Artifact, ArtifactError
 from agility_rl.envs import AgilityEnv
-from agility_rl.envs.agility_state import AgilityState
-from agility_rl.envs.agility_terminations import AGILITY_TERMINATIONS
 from agility_rl.envs.misjudgement import LASTING
 from agility_rl.envs.obstacles import OBSTACLES
 from agility_rl.modules import Teacher
 from agility_rl.record.mcap_logger import read_scalars
-from agility_rl.training import rewind
 
 Module = Callable[[str], ModuleType]
 
@@ -68,18 +65,11 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(recipe: ModuleType, smok
         assert torch.equal(read_scalars(whole)[name][1], read_scalars(halves)[name][1]), name
 
 
-def kicked(state: AgilityState) -> Tensor:
-    """A failure of robots that stand, as those of an untrained controller do: to be faster than 0.3 m/s."""
-    return state.velocity.norm(dim=-1) > 0.3
-
-
+@pytest.mark.usefixtures("failures")
 def test_a_run_that_practises_what_failed_is_resumed_bit_for_bit(
     recipe: ModuleType, smoke: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Snapshots are of this run alone: those that are kept are in its checkpoints."""
-    monkeypatch.setattr(rewind, "LEAST", 1)
-    monkeypatch.setattr(rewind, "BACK", (0.0, 0.2))
-    monkeypatch.setitem(AGILITY_TERMINATIONS, "sunk", kicked)  # type: ignore[arg-type]
     begun = []
     restore = AgilityEnv.restore
 
@@ -88,11 +78,8 @@ def test_a_run_that_practises_what_failed_is_resumed_bit_for_bit(
         return restore(env, rows, snapshot)
 
     monkeypatch.setattr(AgilityEnv, "restore", watched)
-    smoke = replace(
-        smoke,
-        ppo=replace(smoke.ppo, steps=30),
-        env=replace(smoke.env, push_interval=0.4, rewound=0.25),
-    )
+    ppo, env = replace(smoke.ppo, steps=30, rewound=0.25), replace(smoke.env, push_interval=0.4)
+    smoke = replace(smoke, ppo=ppo, env=env)
     whole = recipe.train(replace(smoke, name="whole", iterations=4))
     assert begun and begun[0] == [0, 1], "two of eight"
     count = len(begun)
@@ -275,7 +262,7 @@ def test_the_curriculum_by_hand(module: Module) -> None:
         (("--env.course", "nowhere.toml"), "nowhere.toml: cannot be read"),
         (("--behaviours", "trot", "gallop"), "unknown gallop"),
         (("--env.fastest-canter", "0.5"), "fastest canter: expected more than 0.8 and at most 5 m/s, got 0.5"),
-        (("--env.rewound", "1"), "--env.rewound: expected a share from 0 to less than 1, got 1.0"),
+        (("--ppo.rewound", "1"), "--ppo.rewound: expected a share from 0 to less than 1, got 1.0"),
         (("--bbc", "nowhere"), "nowhere"),
         (("--env.num-robot", "3"), "did you mean --env.num-robots"),
     ],

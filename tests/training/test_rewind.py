@@ -35,10 +35,10 @@ class Clock:
 
 
 def watched(one: Rewind, clock: Clock, steps: int) -> None:
-    """A roll-out of so many steps."""
+    """A roll-out of so many steps, in which the policy counts them too."""
     act = one.watching(lambda td: td)
     for clock.now in range(steps):
-        act(TensorDict({}, [N]))
+        act(TensorDict({"memory": {"count": torch.full((N,), clock.now)}}, [N]))
 
 
 def ends(steps: int, *where: tuple[int, int]) -> Tensor:
@@ -85,6 +85,25 @@ def test_nobody_begins_elsewhere_before_enough_has_failed(
         assert one.kept is not None and clock.placed.is_empty() == (len(one.kept) < 3)
     assert one.kept["robot"].tolist() == [4, 5, 3, 4], "the newest"
     assert clock.placed["rows"].tolist() == [0, 1] and set(clock.placed["from", "robot"].tolist()) <= {3, 4, 5}
+    course.close()
+
+
+def test_what_the_policy_remembered_then_comes_back_too(
+    generator: torch.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rewind, "LEAST", 1)
+    clock, count = Clock(), ("memory", "count")
+    one = Rewind(clock, 2, DT, generator, carried=[count])
+    course = AgilityEnv(N, stand, simulator_options={"num_threads": 1})
+    rollout = Rollout(course, 1, **KEPT)
+    rollout.collect(course.rand_action)
+    assert rollout.carrier is not None
+    rollout.carrier[count] = torch.full((N,), -1)
+    watched(one, clock, 100)
+    failed = ends(100, (80, 3), (90, 4))
+    one.remember(failed, failed)
+    one.begin(rollout)
+    assert rollout.carrier[count].tolist() == [*clock.placed["from", "step"].tolist(), -1, -1, -1, -1]
     course.close()
 
 
