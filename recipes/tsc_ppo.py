@@ -62,7 +62,10 @@ class Learner:
         return 0 if self.rewind is None else len(self.rewind.rows)
 
     def collect(self, policy: Policy) -> TensorDictBase:
-        """Experience ``[T, N]`` of a policy that tries something else now and then."""
+        """Experience ``[T, N]`` of a policy that tries something else now and then.
+
+        The first :attr:`num_rewound` robots practise what fails.
+        """
         policy = policy if self.noise is None else self.noise.around(policy)
         if self.rewind is None:
             return self.rollout.collect(policy)

@@ -107,7 +107,7 @@ class Rewind:
         def act(td: TensorDictBase) -> TensorDictBase:
             nonlocal step
             if step % self.apart == 0:
-                self._taken.append(self.env.snapshot().set("carried", td.select(*self.carried)))
+                self._taken.append(self.env.snapshot().set("carried", td.select(*self.carried).clone()))
             step += 1
             return policy(td)
 
