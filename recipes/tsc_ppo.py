@@ -101,7 +101,7 @@ def make_learner(
         keep_in_minibatches: entries that the update's ``extra`` reads.
 
     Raises:
-        ValueError: if no share of the robots shall begin where others failed, or nobody else.
+        ValueError: if ``ppo.rewound`` is no share of the robots, or leaves none that go on from where they were.
     """
     if not 0.0 <= ppo.rewound < 1.0:
         raise ValueError(f"--ppo.rewound: expected a share from 0 to less than 1, got {ppo.rewound}")
