@@ -4,7 +4,7 @@ The plain loop is Hybrid-PPO written by hand: plain networks of the same sizes, 
 as the given preset of ``recipes/tsc_teacher.py`` (those whose teacher reads its place and learns from the chosen
 behaviour's parameters), preallocated memory, fused optimisers, float32. Both step the same
 kind of environment, which holds the controller; the plain one keeps no statistics of obstacles and leaves curriculum
-and moving average out.
+and moving average out. In neither is a robot put back to where others were before they failed.
 
     python benchmarks/plain_teacher.py --iterations 10
 """
@@ -228,7 +228,7 @@ def main() -> None:
     args = parser.parse_args()
     cfg = recipe.PRESETS[args.preset]
     cfg = replace(cfg, env=replace(cfg.env, num_robots=args.robots or cfg.env.num_robots))
-    cfg = replace(cfg, adaptation=replace(cfg.adaptation, every=0))
+    cfg = replace(cfg, adaptation=replace(cfg.adaptation, every=0), ppo=replace(cfg.ppo, rewound=0.0))
     parts, plain = recipe.build(cfg), Plain(recipe.build(cfg), cfg)
     runs = {
         "recipe": lambda number: recipe.iterate(parts, cfg, START + number),

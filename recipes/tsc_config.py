@@ -242,6 +242,7 @@ CPU = Config(
     ),
     ppo=PPOConfig(
         steps=40,
+        rewound=0.4,
         minibatches=4,
         learning_rate=1e-4,
         critic_learning_rate=3e-4,

@@ -91,7 +91,9 @@ class Config(HardwareConfig):
     )
     """Way-points are reached within 0.4 m, as a teacher's; 0.45 m in the evaluation."""
     ppo: PPOConfig = field(
-        default_factory=lambda: replace(TEACHER.ppo, critic_learning_rate=1e-3, initial_std=0.15, critic_warm_up=12)
+        default_factory=lambda: replace(
+            TEACHER.ppo, rewound=0.0, critic_learning_rate=1e-3, initial_std=0.15, critic_warm_up=12
+        )
     )
     reward: RewardConfig = field(default_factory=lambda: replace(TEACHER.reward, imitation=0.0))
     curriculum: CurriculumConfig = field(

@@ -124,9 +124,15 @@ KEPT = {
 }
 
 
-@pytest.fixture
-def env() -> Iterator[AgilityEnv]:
-    env = AgilityEnv(N, topple, decision_steps=2, seed=3, simulator_options={"num_threads": 1})
+ENGINES = [
+    pytest.param({"name": "batch", "num_threads": 1}, id="batch"),
+    pytest.param({"name": "warp", "device": "cpu"}, id="warp", marks=pytest.mark.slow),
+]
+
+
+@pytest.fixture(params=ENGINES)
+def env(request: pytest.FixtureRequest) -> Iterator[AgilityEnv]:
+    env = AgilityEnv(N, topple, decision_steps=2, seed=3, simulator_options=request.param)
     yield env
     env.close()
 
