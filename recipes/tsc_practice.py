@@ -95,6 +95,8 @@ class Config(HardwareConfig):
             TEACHER.ppo, rewound=0.0, critic_learning_rate=1e-3, initial_std=0.15, critic_warm_up=12
         )
     )
+    """A teacher's, but nobody is rewound: what that brought students is within what chance does
+    (docs/student_experiments.md)."""
     reward: RewardConfig = field(default_factory=lambda: replace(TEACHER.reward, imitation=0.0))
     curriculum: CurriculumConfig = field(
         default_factory=lambda: CurriculumConfig(difficulty=1.0, obstacles=6, practice=1.0)
