@@ -105,6 +105,12 @@ def make_learner(
     """
     if not 0.0 <= ppo.rewound < 1.0:
         raise ValueError(f"--ppo.rewound: expected a share from 0 to less than 1, got {ppo.rewound}")
+    num_rewound = round(ppo.rewound * env.num_robots)
+    if num_rewound == env.num_robots:
+        raise ValueError(
+            f"--ppo.rewound {ppo.rewound} of {num_rewound} robots is all of them; expected one left that goes on: "
+            "take a smaller share, or more robots (--env.num-robots)"
+        )
     width = sum(env.observation_spec[key].shape[1:].numel() for key in OBSERVED)
     critic = Critic(width, in_keys=list(OBSERVED), hidden=ppo.hidden).to(env.device)
     groups: list[dict[str, Any]] = [{"params": list(trained.parameters())}]
@@ -132,8 +138,8 @@ def make_learner(
     if ppo.desired_kl is not None:
         schedule = KLAdaptiveLR(FirstGroup(optimizer), ppo.desired_kl, max_lr=ppo.max_learning_rate)
     decision_dt, noise, rewind = env.dt * env.decision_steps, None, None
-    if count := round(ppo.rewound * env.num_robots):
-        rewind = Rewind(env, count, decision_dt, seeds.generator("rewind"), carried)
+    if num_rewound:
+        rewind = Rewind(env, num_rewound, decision_dt, seeds.generator("rewind"), carried)
     if ppo.noise_seconds is not None:
         noise = LastingNoise(
             ppo.noise_seconds, decision_dt, seeds.generator("exploration"), (keys.ACTION, keys.PARAMETERS)

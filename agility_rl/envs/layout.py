@@ -191,11 +191,18 @@ class CourseLayout:
 def scenery(course: Course) -> tuple[Piece, ...]:
     """What a simulator must hold for a course: the pieces of its obstacles, slot by slot, then its walls.
 
+    Raises:
+        TypeError: if ``course`` is none, such as the name of one.
+
     Example:
         >>> from agility_rl.envs.course_presets import COURSES
         >>> [piece.name for piece in scenery(COURSES["bar_jump"])][:3]
         ['0_bar_jump_wings', '0_bar_jump_bar', 'wall_0']
     """
+    if not isinstance(course, Course):
+        raise TypeError(
+            f"expected a Course, such as agility_rl.envs.COURSES['full'], got {type(course).__name__} {course!r}"
+        )
     return tuple(
         Piece(f"{index}_{slot.kind.name}_{piece.name}", piece.shapes, piece.hinge)
         for index, slot in enumerate(course.slots)

@@ -338,6 +338,8 @@ def test_wrong_arguments_are_refused(build: Build) -> None:
         build(2, simulator=make_simulator(num_simulations=2, num_threads=1))
     with pytest.raises(ValueError, match="decision_steps"):
         build(1, decision_steps=0)
+    with pytest.raises(TypeError, match=r"expected a Course, such as .*, got str 'full'"):
+        build(1, course="full")
 
 
 def test_close_releases_the_engine(build: Build) -> None:

@@ -263,6 +263,7 @@ def test_the_curriculum_by_hand(module: Module) -> None:
         (("--behaviours", "trot", "gallop"), "unknown gallop"),
         (("--env.fastest-canter", "0.5"), "fastest canter: expected more than 0.8 and at most 5 m/s, got 0.5"),
         (("--ppo.rewound", "1"), "--ppo.rewound: expected a share from 0 to less than 1, got 1.0"),
+        (("--ppo.rewound", "0.95"), "--ppo.rewound 0.95 of 8 robots is all of them"),
         (("--bbc", "nowhere"), "nowhere"),
         (("--env.num-robot", "3"), "did you mean --env.num-robots"),
     ],
