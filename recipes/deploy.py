@@ -41,7 +41,7 @@ from agility_rl.deploy import (
     Mode,
     SafetyLimits,
 )
-from agility_rl.deploy.controller import StepRecord
+from agility_rl.deploy.controller import SINK_SECONDS, StepRecord
 from agility_rl.deploy.deadlines import Clock, Durations, MonotonicClock
 from agility_rl.deploy.depth import DepthSource
 from agility_rl.deploy.operator import Operation, SharedControl
@@ -50,8 +50,6 @@ from agility_rl.go2.model import build_spec
 from agility_rl.record import EpisodeRecorder, free_file, is_free
 from agility_rl.training import cli, run_folder
 
-SINK_SECONDS = 1.5
-"""Time for which damping is still commanded at the end, while the robot sinks down."""
 PATIENCE = 3.0
 """Time for which a refused request is repeated [s]."""
 SHOWN_MISSES = 20
@@ -146,13 +144,27 @@ def summary(controller: Controller, lost: float | None, started: float) -> str:
     return "\n".join(lines)
 
 
+def recording(cfg: Config) -> Path:
+    """The file to record to, which is not there yet."""
+    path = free_file(Path("runs") / "deploy", "deploy") if cfg.output is None else cfg.output
+    if path.suffix != ".mcap" or not is_free(path):
+        raise ValueError(f"expected --output to be a new file that ends in .mcap, got {path}")
+    return path
+
+
+def sink(controller: Controller, on_step: Callable[[StepRecord], None] | None) -> None:
+    """Go on commanding damping until the robot lies: one packet, if it is lost, leaves the motors stiff."""
+    controller.on_step = on_step
+    if controller.mode is Mode.DAMPING:  # not if another program has the robot, which was never driven
+        for _ in range(round(SINK_SECONDS / controller.bbc.period)):
+            controller.step()
+
+
 def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[Path, Controller]:
     """Run, record, print what happened."""
     command = BehaviourCommand.of(cfg.skill, velocity_x=cfg.speed, yaw_rate=cfg.yaw_rate, height=cfg.height)
     bbc = cfg.controller(cfg.artifact)
-    path = free_file(Path("runs") / "deploy", "deploy") if cfg.output is None else cfg.output
-    if path.suffix != ".mcap" or not is_free(path):
-        raise ValueError(f"expected --output to be a new file that ends in .mcap, got {path}")
+    recording(cfg)
     cfg.check()
     if cfg.real and cfg.operator == "script" and not cfg.unattended:
         raise ValueError(
@@ -186,6 +198,7 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
             stack.callback(device.close)
         simulated_camera = cfg.task is not None and own_camera is None
         transport, robot = stack.enter_context(connect(cfg, robot_options, simulated_camera))
+        path = recording(cfg)  # anew: another run may have begun since
         episode = stack.enter_context(EpisodeRecorder(path, dt=bbc.period, metadata=metadata))
         started = clock.now()
         policy = cfg.commander(
@@ -208,10 +221,10 @@ def drive(cfg: Config, clock: Clock, interrupted: Callable[[], bool]) -> tuple[P
         gc.freeze()  # what was loaded until here need not be looked through again in the middle of a step
         try:
             controller.run(until=lambda: procedure.finished or interrupted())
-            controller.on_step = record
-            if controller.mode is Mode.DAMPING:  # not if another program has the robot, which was never driven
-                for _ in range(round(SINK_SECONDS / bbc.period)):
-                    controller.step()
+            sink(controller, record)
+        except Exception:
+            sink(controller, None)  # a recorder or device that fails is not asked again
+            raise
         finally:
             gc.unfreeze()
     print(summary(controller, None if robot is None else robot.lost, started))

@@ -52,7 +52,7 @@ SAME_DECISION = 1e-4
 """The same of a student where rows are answered one by one, or by onnxruntime: each of its features is a sum of tens of
 thousands of products, which is rounded otherwise than in a batch. In a batch it must be :data:`SAME_ANSWER`."""
 BATCH = 64
-_WRITTEN_ANEW = ("format", "format_version", "weights", "onnx", CHECKSUM, "limits", "normalisers")
+_WRITTEN_ANEW = ("format", "format_version", "weights", "onnx", CHECKSUM)
 
 
 @dataclass(frozen=True)

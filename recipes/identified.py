@@ -14,7 +14,7 @@ from torch import Tensor
 from agility_rl.collectors import ParameterSpace
 from agility_rl.collectors.parameters import Parameter
 from agility_rl.envs.randomization import NOMINAL, Randomization
-from agility_rl.go2.constants import NUM_JOINTS
+from agility_rl.go2 import constants
 
 
 @dataclass(frozen=True)
@@ -39,17 +39,18 @@ class SimulatorFile:
     def one_robot(self, stiffness: Sequence[float], damping: Sequence[float]) -> dict[str, Any]:
         """Options of a :class:`agility_rl.deploy.simulated.SimulatedRobot` that is commanded with some gains.
 
+        Gains that the file leaves open are nominal.
+
         Raises:
             ValueError: if something differs that a simulated robot cannot have.
         """
         drawn = self.draw(1, torch.Generator().manual_seed(0))
         if extra := set(drawn) - {"stiffness", "damping"}:
             raise ValueError(f"expected a simulator that differs in stiffness and damping only, got {sorted(extra)}")
-        factors = {
-            "stiffness_factor": drawn["stiffness"][0] / torch.tensor(stiffness),
-            "damping_factor": drawn["damping"][0] / torch.tensor(damping),
-        }
-        return {name: factor.tolist() for name, factor in factors.items()} | dict(self.model)
+        nominal = {"stiffness": constants.STIFFNESS, "damping": constants.DAMPING}
+        true = {name: drawn.get(name, torch.full((1, constants.NUM_JOINTS), gain))[0] for name, gain in nominal.items()}
+        commanded = {"stiffness": torch.tensor(stiffness), "damping": torch.tensor(damping)}
+        return {f"{name}_factor": (true[name] / commanded[name]).tolist() for name in nominal} | dict(self.model)
 
 
 def load_simulator(path: Path) -> SimulatorFile:
@@ -99,7 +100,7 @@ def _truth(content: Mapping[str, Any], parameters: Mapping[str, Any]) -> Simulat
 
 def known_fields(model: Mapping[str, Any]) -> dict[str, list[float]]:
     """What joints have that no parameter of a space sets: the dry friction of the model, if it says one."""
-    return {"friction_loss": [model["friction_loss"]] * NUM_JOINTS} if "friction_loss" in model else {}
+    return {"friction_loss": [model["friction_loss"]] * constants.NUM_JOINTS} if "friction_loss" in model else {}
 
 
 def _there(fields: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:

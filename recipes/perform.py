@@ -79,8 +79,8 @@ def command_for(skill: int, speed: float | None, yaw_rate: float) -> Tensor:
     return command[None]
 
 
-def perform(controller: Controller, config: Config, path: Path) -> str | None:
-    """Drive one robot and write the episode; returns when and in which behaviour it fell, if it did."""
+def perform(controller: Controller, config: Config, folder: Path) -> tuple[Path, str | None]:
+    """Drive one robot and write the episode; returns its file, and when and in which behaviour it fell, if it did."""
     motion = load_motion(config.motion, controller.trained, config.seed)
     env = make_env(1, controller, motion.start_states(config.seed), num_threads=1, seed=config.seed)
     skills = [skill_index(name) for name in config.behaviours]
@@ -90,6 +90,7 @@ def perform(controller: Controller, config: Config, path: Path) -> str | None:
     metadata = {"pieces": pieces, "weights": controller.artifact.manifest["weights"]["sha256"], "seed": config.seed}
     fall: str | None = None
     simulator = env.simulator
+    path = free_file(folder, "perform")
     with EpisodeRecorder(path, dt=env.dt, metadata=metadata) as recorder:
         for step, td in enumerate(drive(controller.bbc, env, schedule)):
             name = config.behaviours[step // steps]
@@ -111,7 +112,7 @@ def perform(controller: Controller, config: Config, path: Path) -> str | None:
                 },
             )
     env.close()
-    return fall
+    return path, fall
 
 
 def render(episode: Path, picture: Path, skin: Path | None) -> str | None:
@@ -155,8 +156,7 @@ def main(config: Config, console: Console) -> Path:
         skill_index(name)
     controller = load_controller(config.run)
     output = config.output or controller.run
-    episode = free_file(output / "episodes", "perform")
-    fall = perform(controller, config, episode)
+    episode, fall = perform(controller, config, output / "episodes")
     plots = {
         f"{title}": [f"/command.{key}", f"/measured.{key}"]
         for title, key in zip(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +20,10 @@ from agility_rl.go2.model import build_spec
 
 CONNECT_SECONDS = 60.0
 """Time to wait for the robot's first state [s]."""
+_TRANSPORTS = {"interface": ("dds",), "feet": ("dds",), "ttl": ("lcm",), "domain": ("dds", "lcm")}
+"""Options that mean something with some transports only."""
+_SIMULATED = {"pose", "sim_dt", "friction_loss", "course", "course_seed", "world", "simulator"}
+"""Options of simulated robots."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,19 +62,21 @@ class RobotConfig:
         return self.interface is not None or self.ttl > 0
 
     def check(self) -> None:
-        """Refuse options of another transport.
+        """Refuse options of another transport or robot.
 
         Raises:
             ValueError: naming the option, or a world that is no MJCF file.
         """
-        for option, transport in {"interface": "dds", "ttl": "lcm"}.items():
-            if getattr(self, option) and self.transport != transport:
-                raise ValueError(
-                    f"expected --{option} only with --transport {transport}, got --transport {self.transport}"
-                )
-        for option in ("simulator", "course", "world"):
-            if self.real and getattr(self, option) is not None:
-                raise ValueError(f"expected --{option} only with a simulated robot, got a real one")
+        default = RobotConfig()
+        for option in (entry.name for entry in fields(RobotConfig)):
+            if getattr(self, option) == getattr(default, option):
+                continue
+            flag, transports = "--" + option.replace("_", "-"), _TRANSPORTS.get(option, (self.transport,))
+            if self.transport not in transports:
+                wanted = " or ".join(transports)
+                raise ValueError(f"expected {flag} only with --transport {wanted}, got --transport {self.transport}")
+            if self.real and option in _SIMULATED:
+                raise ValueError(f"expected {flag} only with a simulated robot, got a real one")
         if not self.sim_dt > 0.0:
             raise ValueError(f"expected --sim-dt above 0 s, got {self.sim_dt}")
         if self.course is not None and self.world is not None:

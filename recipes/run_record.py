@@ -17,7 +17,7 @@ class Recorder:
     """Writes every control step: for eyes, and in the form of a robot log.
 
     Rows into which no transition of the behaviour controller leads have ``start`` 1: standing up, damping, and steps
-    after a missed one.
+    that came too early or too late after the one before.
     """
 
     def __init__(self, episode: EpisodeRecorder, bbc: DeployedBBC, task: DeployedStudent | None = None) -> None:

@@ -96,6 +96,11 @@ def begin(parts: Components, cfg: Config) -> None:
             start = replace(start, state=widen_place(start.state, place - read_place))
         if (had := fastest_canter(start)) != cfg.env.fastest_canter:  # it canters as fast as it did
             start = replace(start, state=rescale_canter(start.state, had, cfg.env.fastest_canter))
+            if had > cfg.env.fastest_canter:
+                print(
+                    f"{start.folder} canters at up to {had} m/s; what is faster than --env.fastest-canter "
+                    f"{cfg.env.fastest_canter} becomes that"
+                )
         start.fill(parts.teacher)
         limit_deviations(parts.teacher.actor, cfg.ppo)
     if copies(cfg):

@@ -24,6 +24,8 @@ FOLDED_POSE = (0.0, 1.36, -2.65) * 4
 """Joint angles [rad] of a robot that lies on its trunk with its legs folded under it."""
 DAMPING_GAIN = 3.0
 """Damping of every joint in the state ``damping`` [N m s/rad]; chosen by us."""
+SINK_SECONDS = 1.5
+"""Time that a robot in the state ``damping`` takes to sink down [s]; chosen by us."""
 FOLD_SECONDS = 1.0
 """Time to fold the legs before standing up [s]."""
 RISE_SECONDS = 1.0
@@ -90,7 +92,8 @@ class StepRecord:
         action: ``[12]`` [action units] in the mode ``run``, else ``None``.
         behaviour: what was commanded to the behaviour controller in the mode ``run``, else ``None``.
         estimate: ``[4]`` (:data:`agility_rl.keys.ESTIMATE`) in the mode ``run``, else ``None``.
-        continues: the step before it was in the mode ``run`` too and none was skipped between.
+        continues: the step before it was in the mode ``run`` too, and its state came a period before this one, give or
+            take half of one.
         duration: from its beginning until the command was sent [s].
         lateness: by how much it began too late [s].
     """
@@ -125,6 +128,7 @@ class Controller:
 
     Attributes:
         mode: present mode.
+        entered: when that began, on the clock [s].
         fault: what led to ``damping`` the last time, if it was a fault and no request has been granted since.
         events: most recent changes of mode, refusals and misses.
         deadlines: periods, misses, durations, latenesses.
@@ -175,9 +179,10 @@ class Controller:
         self.fault: Fault | None = None
         self.events: deque[Event] = deque(maxlen=EVENTS)
         self._request: Mode | None = None
-        self._entered = self.clock.now()
+        self.entered = self.clock.now()
         self._start_pose: Tensor | None = None
-        self._from_run = self._continues = False
+        self._from_run = False
+        self._ran_from: RobotState | None = None
         self._folded = torch.tensor(FOLDED_POSE)
 
     # -- from outside ------------------------------------------------------------------------------------------------
@@ -206,6 +211,7 @@ class Controller:
         """
         if self.mode is Mode.PASSIVE and self.transport.other_commanders():
             return
+        self._request = None  # what was asked for before must not lead out of it
         self._enter(Mode.DAMPING, reason)
         self.transport.send(JointCommand.damped(DAMPING_GAIN))
 
@@ -219,7 +225,7 @@ class Controller:
         action: Tensor | None = None
         behaviour: BehaviourCommand | None = None
         state: RobotState | None = None
-        was_running = self.mode is Mode.RUN and self._continues and not tick.skipped
+        before = self._ran_from if self.mode is Mode.RUN else None
         try:
             state = self.transport.read()
             self._grant(state, now)
@@ -253,14 +259,20 @@ class Controller:
             action=action,
             behaviour=behaviour,
             estimate=self.bbc.estimate if running else None,
-            continues=was_running and running,
+            continues=running and self._follows(state, before),
             duration=duration,
             lateness=tick.lateness,
         )
-        self._continues = running
+        self._ran_from = state if running else None
         if self.on_step is not None:
             self.on_step(record)
         return record
+
+    def _follows(self, state: RobotState | None, before: RobotState | None) -> bool:
+        """Whether one control step lies between two states: late ones come closer together, or farther apart."""
+        if state is None or before is None:
+            return False
+        return abs(state.time - before.time - self.bbc.period) < 0.5 * self.bbc.period
 
     def _check(self, state: RobotState | None, now: float) -> Fault | None:
         """Everything that must hold while the joints are driven."""
@@ -283,7 +295,7 @@ class Controller:
         target = self.bbc.default_pose
         if self.mode is Mode.STAND_UP:
             assert self._start_pose is not None
-            elapsed = now - self._entered
+            elapsed = now - self.entered
             if self._from_run:
                 target = torch.lerp(self._start_pose, target, min(elapsed / SETTLE_SECONDS, 1.0))
                 finished = elapsed >= 2.0 * SETTLE_SECONDS
@@ -339,7 +351,7 @@ class Controller:
     def _enter(self, mode: Mode, reason: str) -> None:
         if mode is self.mode:
             return
-        self.mode, self._entered = mode, self.clock.now()
+        self.mode, self.entered = mode, self.clock.now()
         self._note("mode", reason)
 
     def _note(self, kind: str, reason: str) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from agility_rl import behaviours, rotations
 from agility_rl.deploy.commander import BehaviourCommand, Commander, Perception
-from agility_rl.deploy.controller import Controller, Mode, StepRecord
+from agility_rl.deploy.controller import SINK_SECONDS, Controller, Mode, StepRecord
 from agility_rl.deploy.transport import RobotState
 from agility_rl.go2 import constants, features, kinematics
 
@@ -267,6 +267,9 @@ class Device(Protocol):
 class Operation:
     """Joins a device to a controller: call it with the record of every control step.
 
+    While the robot sinks down, the key to go on does nothing: it was meant for the mode before, and would make the
+    robot limp.
+
     Args:
         controller: whose modes are requested; its commander is ``control``, or stands above it.
         control: the person's wishes.
@@ -301,6 +304,8 @@ class Operation:
         if self.device.connected():
             self.control.heard(step.time)
         wanted = self.control.request(step.mode)
+        if wanted is Mode.PASSIVE and step.time - self.controller.entered < SINK_SECONDS:
+            wanted = None
         self.asked = wanted is not None
         if wanted is not None:
             self.controller.request(wanted)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import mujoco
@@ -44,6 +45,9 @@ class SimulatedCamera:
         self.robot = robot
         self._now = (lambda: robot.time) if now is None else now
         self._trunk = robot.model.body("trunk").id
+        self._model = copy(robot.model)
+        own = self._model.body_rootid[self._model.geom_bodyid] == self._trunk
+        self._model.geom_rgba[own, 3] = 1.0  # a skin makes them transparent, and rays pass through what is
         self._rays = camera.pixel_directions(pitch).reshape(-1, 3).double().numpy()
         self._distance: Any = np.empty(len(self._rays))
         self._geom: Any = np.empty(len(self._rays), dtype=np.int32)
@@ -51,7 +55,7 @@ class SimulatedCamera:
 
     def counts(self) -> np.ndarray:
         """Depths as the robot stands now, uint16 ``[58, 87]`` [mm]."""
-        model, data, trunk = self.robot.model, self.robot.data, self._trunk
+        model, data, trunk = self._model, self.robot.data, self._trunk
         turn = data.xmat[trunk].reshape(3, 3)
         eye = data.xpos[trunk] + turn @ np.array(camera.POSITION)
         rays = np.ascontiguousarray(self._rays @ turn.T).reshape(-1)

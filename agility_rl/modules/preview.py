@@ -16,7 +16,7 @@ NEXT = (0.2**2, 0.29**2, 0.07**2)
 0.35 m aside."""
 VIEW_DISTANCE, VIEW_ANGLE = 4.2, 0.8
 """Nearer than this [m], and by less than this [rad] beside where the robot looks, it is looked for: parts of it may be
-within the 4 m and 0.76 rad of the camera (method notes, section 5.8)."""
+within the 4 m (method notes, section 5.8) and 0.66 rad of an image (:mod:`agility_rl.go2.camera`)."""
 ALIKE = (0.2**2, 0.2**2, 0.08**2)
 """Variance of a match, beside its own: images in a row err alike."""
 EVIDENCE = 0.5

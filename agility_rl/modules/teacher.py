@@ -46,7 +46,7 @@ def widen_place(weights: Mapping[str, Tensor], more: int) -> dict[str, Tensor]:
 def rescale_canter(weights: Mapping[str, Tensor], fastest: float, now: float) -> dict[str, Tensor]:
     """Weights whose canters are commanded as fast as before when another fastest canter is the end of the range.
 
-    Speeds that the old range cut off at its end are the only ones that become others.
+    Speeds that the old range cut off at its end become others, and those beyond the end of the new one become that.
 
     Source: no equation of the paper (ours).
 

@@ -70,7 +70,7 @@ def read_bvh(path: str | Path) -> BVHMotion:
     """
     path = Path(path)
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     except OSError as error:
         raise MotionError(f"{path}: expected a BVH file, got {error}") from error
     if not lines or lines[0].strip() != "HIERARCHY":

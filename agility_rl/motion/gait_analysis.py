@@ -299,7 +299,7 @@ def stance(feet: Tensor, velocity: Tensor, yaw_rate: Tensor, dt: float) -> Tenso
     """When a foot stands, bool ``[*B, T, 4]``: it goes forward over the ground at less than half of the trunk's speed.
 
     Feet of retargeted dogs hover or sink by centimetres, so heights and forces would not measure dog and robot alike;
-    on the synthetic gaits, whose contacts are known, their share of the time is right to 0.06.
+    on the synthetic gaits, whose contacts are known, their share of the time is right to 0.09.
 
     Args:
         feet: ``[*B, T, 4, 3]`` [m] relative to the trunk, heading frame.

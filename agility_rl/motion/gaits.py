@@ -183,7 +183,7 @@ def synthetic_dataset_clips(seed: int = 0) -> tuple[list[MotionClip], list[Motio
 
     Returns:
         Two labelled clips a behaviour (3 s, straight on), and unlabelled ones (4 s) over each behaviour's speeds with
-        turns and side steps: 8 walk, 8 pace, 6 trot, 5 canter, 5 jump. Turn rates are commanded ones, halved.
+        turns of up to 0.5 rad/s and side steps: 8 walk, 8 pace, 6 trot, 5 canter, 5 jump.
 
     Example:
         >>> labelled, unlabelled = synthetic_dataset_clips()

@@ -105,7 +105,7 @@ def read_keypoints(path: str | Path, dt: float = FRAME_TIME) -> Keypoints:
     path = Path(path)
     columns = 3 * len(POINTS)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise MotionError(f"{path}: expected a table of {columns} columns, got {error}") from error
     rows = []

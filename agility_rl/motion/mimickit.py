@@ -35,7 +35,8 @@ class PlainUnpickler(pickle.Unpickler):
             MotionError: always.
         """
         raise MotionError(
-            f"the pickle asks for {module}.{name}; only dict, list, str and numbers are read from motion files"
+            f"the pickle asks for {module}.{name}; only dict, list, str and numbers are read from motion files; "
+            "save arrays with .tolist() and their numbers with float()"
         )
 
 

@@ -125,6 +125,13 @@ def test_a_stop_is_not_undone_by_what_is_asked_for_after_it(running: Running) ->
     assert controller.step().mode is Mode.PASSIVE
 
 
+def test_a_stop_forgets_what_was_asked_for_before_it(running: Running, bus: FakeBus) -> None:
+    controller = running()
+    controller.request(Mode.PASSIVE)
+    controller.stop()
+    assert controller.step().mode is Mode.DAMPING and is_damping(bus.sent[-1])
+
+
 def test_a_run_begins_only_from_the_default_pose(controller: Controller, bus: FakeBus, running: Running) -> None:
     controller.request(Mode.STAND_UP)
     while controller.mode is not Mode.READY:
@@ -253,6 +260,17 @@ def test_one_late_state_or_step_is_forgiven(running: Running, bus: FakeBus, cloc
     assert missed == "skipped 1 control steps, woke 10.0 ms late"
     bus.age = 0.0
     assert controller.step().mode is Mode.RUN
+
+
+def test_steps_that_come_closer_together_or_farther_apart_are_no_transitions(
+    running: Running, clock: ManualClock
+) -> None:
+    controller = running()
+    assert controller.step().continues
+    clock.time += 0.035  # 15 ms late, and the next one is due 5 ms later
+    records = [controller.step() for _ in range(3)]
+    assert [record.continues for record in records] == [False, False, True]
+    assert records[0].lateness == pytest.approx(0.015)
 
 
 def test_after_a_fault_it_can_stand_up_again(running: Running, bus: FakeBus) -> None:

@@ -230,6 +230,29 @@ def test_a_keyboard_takes_the_robot_up_and_down(driven: tuple[Controller, Keyboa
     assert len(keyboard.shown) == pytest.approx(156 / 2, abs=1)
 
 
+def test_a_key_that_was_meant_for_the_mode_before_does_not_make_a_sinking_robot_limp(
+    driven: tuple[Controller, Keyboard, Callable[[int], None]],
+) -> None:
+    controller, keyboard, steps = driven
+    for _ in range(2):
+        keyboard.keys = ["enter"]
+        steps(150)
+    assert controller.mode is Mode.RUN
+    assert isinstance(controller.transport, FakeBus)
+    controller.transport.age = 1.0
+    keyboard.keys = ["enter"]
+    steps(2)
+    assert controller.mode is Mode.DAMPING and controller.fault is not None
+    for _ in range(7):
+        keyboard.keys = ["enter"]
+        steps(10)
+    assert controller.mode is Mode.DAMPING and controller.fault is not None, "1.44 s are not enough"
+    steps(5)
+    keyboard.keys = ["enter"]
+    steps(2)
+    assert controller.mode is Mode.PASSIVE
+
+
 def test_keys_reach_the_policy_and_the_screen(driven: tuple[Controller, Keyboard, Callable[[int], None]]) -> None:
     controller, keyboard, steps = driven
     for _ in range(2):

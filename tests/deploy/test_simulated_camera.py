@@ -62,15 +62,21 @@ def test_it_sees_what_training_shows(tmp_path: Path, pitch: float) -> None:
 
 
 def test_what_only_eyes_see_it_does_not() -> None:
-    """The legs of a robot in a handstand's pose are before its camera, dressed or not."""
+    """The legs of a robot in a handstand's pose are before its camera, dressed or not, and under a skin."""
     folded = np.array([0.0, -1.2, -0.9] * 4)
     images = []
-    for surround in (lambda spec: None, dress):
+
+    def hide(spec: mujoco.MjSpec) -> None:
+        for geom in spec.body("trunk").find_all("geom"):
+            geom.rgba = (*geom.rgba[:3], 0.0)  # as a skin does
+
+    for surround in (lambda spec: None, dress, hide):
         robot = SimulatedRobot(surround=surround)
         robot.data.qpos[7:19] = folded
         mujoco.mj_forward(robot.model, robot.data)
         images.append(SimulatedCamera(robot).counts())
-    np.testing.assert_array_equal(*images)
+    np.testing.assert_array_equal(images[1], images[0])
+    np.testing.assert_array_equal(images[2], images[0])
     assert (images[0] < 400).any(), "the legs are in view"
 
 

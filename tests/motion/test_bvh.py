@@ -56,6 +56,12 @@ def test_positions_of_a_small_skeleton(small: Path) -> None:
     torch.testing.assert_close(position[1], expected)
 
 
+def test_a_byte_order_mark_is_passed_over(small: Path) -> None:
+    plain = read_bvh(small)
+    small.write_text(SMALL, encoding="utf-8-sig")
+    assert torch.equal(read_bvh(small).values, plain.values)
+
+
 def test_position_channels_of_a_joint_lie_in_its_parents_frame(small: Path) -> None:
     text = SMALL.replace("CHANNELS 3 Zrot", "CHANNELS 6 Xposition Yposition Zposition Zrot")
     text = text.replace("300 0 0 0 0 0 0", "300 0 0 0 10 0 0 0 0 0").replace(

@@ -30,6 +30,13 @@ def test_columns_become_points_with_z_up(tmp_path: Path) -> None:
     assert points.point("Head")[2].tolist() == [4.0, -202.0, 104.0]
 
 
+def test_a_byte_order_mark_is_no_number(tmp_path: Path) -> None:
+    path = write(tmp_path / "dog.csv", [row(0), row(1)], separator=",")
+    plain = read_keypoints(path)
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert torch.equal(read_keypoints(path).position, plain.position)
+
+
 def test_z_up_is_a_rotation() -> None:
     matrix = z_up(torch.eye(3)).T
     torch.testing.assert_close(matrix @ matrix.T, torch.eye(3))

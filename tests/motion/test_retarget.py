@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,15 @@ def test_a_standing_dog_becomes_a_standing_robot() -> None:
     )
     assert clip.foot_contact.all()
     assert clip.joint_velocity.abs().max() < 1e-3
+
+
+def test_a_floor_at_another_height_makes_no_difference() -> None:
+    dog = wooden_dog(speed=1.0, step=0.5)
+    raised = replace(dog, position=dog.position + torch.tensor([0.0, 0.0, 0.15]))
+    for grounding in (1.0, None):
+        here, there = retarget(dog, grounding=grounding), retarget(raised, grounding=grounding)
+        torch.testing.assert_close(there.root_position, here.root_position)
+        torch.testing.assert_close(there.joint_position, here.joint_position, atol=1e-4, rtol=0.0)
 
 
 def test_speed_scales_and_direction_stays() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import time
@@ -17,8 +18,10 @@ import torch
 from agility_rl.collectors import RobotLog
 from agility_rl.deploy import BehaviourCommand, Mode, RobotState
 from agility_rl.deploy.controller import StepRecord
+from agility_rl.deploy.deadlines import ManualClock
 from agility_rl.deploy.lcm import address, connect
-from agility_rl.deploy.transport import JointCommand
+from agility_rl.deploy.transport import FakeBus, JointCommand
+from agility_rl.deploy.unitree_messages import FootCalibration
 from agility_rl.go2 import constants
 from agility_rl.record import EpisodeRecorder, read_episode
 
@@ -151,11 +154,36 @@ def test_an_option_of_another_transport_is_named(deploy: ModuleType, untrained: 
         ({"ttl": 1}, "--ttl only with --transport lcm, got --transport mujoco"),
         ({"ttl": 1, "transport": "lcm", "simulator": tmp_path}, "--simulator only with a simulated robot, got a real"),
         ({"ttl": 1, "transport": "lcm", "course": "full"}, "--course only with a simulated robot, got a real"),
+        ({"ttl": 1, "transport": "lcm", "sim_dt": 0.002}, "--sim-dt only with a simulated robot, got a real"),
+        ({"transport": "lcm", "feet": FootCalibration(newtons_per_count=0.7)}, "--feet only with --transport dds, got"),
+        ({"domain": 7}, "--domain only with --transport dds or lcm, got --transport mujoco"),
         ({"course": "full", "world": tmp_path}, "expected --course or --world, got both"),
         ({"ttl": 1, "transport": "lcm"}, "a script makes a real robot stand up and run at once: give --operator"),
     ):
         with pytest.raises(ValueError, match=message):
             deploy.main(deploy.Config(untrained, output=tmp_path / "run.mcap", **options))
+
+
+def test_damping_goes_on_when_the_recorder_fails(
+    deploy: ModuleType, untrained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = ManualClock()
+    bus = FakeBus(clock)
+
+    class FullDisk(deploy.Recorder):
+        def __call__(self, step: StepRecord) -> None:
+            super().__call__(step)
+            if step.mode is Mode.RUN:
+                raise OSError("no space left")
+
+    monkeypatch.setattr(deploy, "connect", lambda *_: contextlib.nullcontext((bus, None)))
+    monkeypatch.setattr(deploy, "Recorder", FullDisk)
+    cfg = deploy.Config(untrained, output=tmp_path / "run.mcap")
+    with pytest.raises(OSError, match="no space left"):
+        deploy.drive(cfg, clock, lambda: False)
+    last = bus.sent[-75:]
+    assert all(bool((sent.damping > 0).all()) and not bool(sent.stiffness.any()) for sent in last), "1.5 s of damping"
+    assert read_episode(tmp_path / "run.mcap")["start/value"].shape[0] > 100, "what was recorded until then is there"
 
 
 def test_a_world_that_is_none_is_refused_before_the_robot_starts(

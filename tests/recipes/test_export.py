@@ -36,6 +36,14 @@ def as_version_1(run: Path) -> None:
     path.write_text(json.dumps({**manifest, "format_version": 1}))
 
 
+def test_an_export_keeps_the_limits_of_an_artifact(export: ModuleType, untrained: Path) -> None:
+    before = Artifact.load(untrained / "policy")
+    slow = {**before.manifest["limits"], "joint_speed": [5.0] * 12}
+    Artifact.save(before.folder, before.state, {**before.manifest, "limits": slow})
+    export.main(export.Config(untrained, steps=8))
+    assert Artifact.load(before.folder).manifest["limits"] == slow
+
+
 def test_an_export_in_place_completes_an_old_artifact(export: ModuleType, untrained: Path) -> None:
     as_version_1(untrained)
     before = Artifact.load(untrained / "policy")

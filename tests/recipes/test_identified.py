@@ -119,6 +119,10 @@ def test_one_robot_has_the_gains_of_the_file(module: Module, result: Path, untra
     assert robot.model.actuator_gainprm[:3, 0].tolist() == [50.0, 40.0, 40.0]
     assert robot.model.actuator_biasprm[:3, 2].tolist() == [-1.0, -1.0, -0.5]
     content = json.loads(file.read_text())
+    open_damping = {name: entry for name, entry in content["parameters"].items() if "stiffness" in name}
+    file.write_text(json.dumps({**content, "parameters": open_damping}))
+    options = module("identified").load_simulator(file).one_robot(*commanded)
+    assert options["stiffness_factor"] == [1.25, 1.0, 1.0] * 4 and options["damping_factor"] == [0.5] * 12
     content["parameters"]["trunk_mass_offset"] = {"value": 1.0, "unit": "kg", "multiple": None}
     file.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"stiffness and damping only, got \['.*mass.*'\]"):
