@@ -1,7 +1,7 @@
 """Where the time of one iteration of the student's training goes: depth, networks, physics.
 
-Untrained networks of the published sizes on the full course; wall time, and the CPU time of all threads, which other
-work on the machine disturbs less.
+Untrained networks of the published sizes, but for teacher and actor (256-128-64, as ``cpu`` has), on the full course;
+wall time, and the CPU time of all threads, which other work on the machine disturbs less.
 
     python benchmarks/student_iteration.py --robots 64 --threads 2
 """

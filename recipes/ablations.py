@@ -13,6 +13,7 @@ A training of the preset ``cpu`` takes some 35 minutes on two free cores.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -74,14 +75,17 @@ class Config:
 
 
 def command(recipe: str, *arguments: str) -> None:
-    """Run a recipe from beside this one; its output is ours.
+    """Run a recipe from beside this one; its output is ours, and so is Ctrl-C: it ends as it does by itself.
 
     Raises:
         ValueError: if it failed.
     """
-    done = subprocess.run([sys.executable, str(Path(__file__).with_name(f"{recipe}.py")), *arguments], check=False)
-    if done.returncode:
-        raise ValueError(f"recipes/{recipe}.py ended with {done.returncode}; what it said stands above")
+    with subprocess.Popen([sys.executable, str(Path(__file__).with_name(f"{recipe}.py")), *arguments]) as process:
+        while process.returncode is None:
+            with contextlib.suppress(KeyboardInterrupt):  # the recipe has heard it too, and saves
+                process.wait()
+    if process.returncode:
+        raise ValueError(f"recipes/{recipe}.py ended with {process.returncode}; what it said stands above")
 
 
 def motion_options(config: MotionConfig) -> list[str]:

@@ -7,7 +7,7 @@ Source: ours; the roll-outs of student and labels of a teacher are those of DAgg
 
 In:  controllers of the same layout (``--teachers BEHAVIOUR PATH BEHAVIOUR PATH ...``, every behaviour once), clips to
      start episodes from (``--motion.labelled DIR``); without them, synthetic gaits.
-Out: ``runs/NAME/`` with ``config.json`` and ``policy/``.
+Out: ``runs/NAME/`` with ``config.json`` and ``policy/``. Ctrl-C ends the round and saves; such a run is not resumed.
 
     python recipes/bbc_distill.py cpu --teachers walk runs/a pace runs/b trot runs/a canter runs/a jump runs/a
     python recipes/bbc_pretrain.py polish --init-from runs/distilled ...     # PPO goes on, and trains a discriminator
@@ -216,6 +216,7 @@ def main(cfg: Config) -> Path:
     first = load_controller(cfg.teachers[0][1])
     bbc = first.bbc
     motion = load_motion(cfg.motion, first.trained, cfg.seed)
+    print(f"episodes start from: {motion.source}")
     world = bbc_config.Config(env=replace(cfg.env, friction_loss=first.friction_loss))
     bbc_changes.check(world)
     env = make_env(world, MotionDataset(motion.labelled, motion.labelled), seeds)
@@ -226,17 +227,18 @@ def main(cfg: Config) -> Path:
     replay = TensorDictReplayBuffer(
         storage=LazyTensorStorage(cfg.memory * cfg.steps * cfg.env.num_robots), batch_size=cfg.batch_size
     )
-    for number in range(cfg.rounds):
-        act = label if number < cfg.teacher_rounds else partial(mean_action, bbc)
-        with torch.no_grad():
-            rows, carrier = collect(env, carrier, act, label, cfg, seeds.generator("noise"))
-        found = errors(bbc, rows)
-        print(
-            f"round {number + 1:2d}: " + "  ".join(f"{name} {value:.3f}" for name, value in found.items()), flush=True
-        )
-        replay.extend(rows)
-        learn(bbc, replay, cfg.updates, optimizer)
-        schedule.step()
+    with run_folder.abandoned_by_errors(folder), cli.interruptible() as interrupted:
+        for number in range(cfg.rounds):
+            act = label if number < cfg.teacher_rounds else partial(mean_action, bbc)
+            with torch.no_grad():
+                rows, carrier = collect(env, carrier, act, label, cfg, seeds.generator("noise"))
+            found = "  ".join(f"{name} {value:.3f}" for name, value in errors(bbc, rows).items())
+            print(f"round {number + 1:2d}: {found}", flush=True)
+            replay.extend(rows)
+            learn(bbc, replay, cfg.updates, optimizer)
+            schedule.step()
+            if interrupted():
+                break
     env.close()
     known = first.artifact.manifest
     learned_from = dict.fromkeys(name for teacher in teachers for name in teacher.artifact.manifest["data"])

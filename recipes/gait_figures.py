@@ -77,7 +77,7 @@ def examples(clips: list[MotionClip]) -> list[MotionClip]:
 
 
 def footfalls(controller: Controller, motion: Motion, reference: TensorDictBase, config: Config) -> Figure:
-    """Every behaviour's footfalls, of a dog on the left and of the robot on the right."""
+    """Every behaviour's footfalls, of a dog, or a synthetic gait, on the left and of the robot on the right."""
     clips = examples(motion.labelled)
     speeds = torch.stack([measure_clip(clip).speed for clip in clips])
     skill = torch.arange(NUM_BEHAVIOURS)
@@ -86,10 +86,15 @@ def footfalls(controller: Controller, motion: Motion, reference: TensorDictBase,
     recording = drive(controller, reference, config, [(steps, skill, told)])
     stands = stance(recording.feet, recording.velocity, recording.yaw_rate, DT)
     figure = new_figure(11.0, 7.5)
+    kind = "synthetic" if motion.synthetic else "dog"
     for row, clip in enumerate(clips):
         robot = recording.velocity[row, -shown:, 0].mean()
         panels = (
-            (f"dog, {clip.name}, {speeds[row]:.2f} m/s", clip_stance(clip)[: round(SHOWN / clip.dt)], clip.dt),
+            (
+                f"{kind}, {clip.name}, {speeds[row]:.2f} m/s",
+                clip_stance(clip)[: round(SHOWN / clip.dt)],
+                clip.dt,
+            ),
             (f"robot, told {BEHAVIOURS[row]} at {told[row, 0]:.2f} m/s: {robot:.2f} m/s", stands[row, -shown:], DT),
         )
         for column, (title, contact, dt) in enumerate(panels):
@@ -193,6 +198,7 @@ def main(config: Config, console: Console) -> list[Path]:
         raise ValueError("expected --settle of at least 0, --stay of at least 0.02 s and --robots of at least 1")
     controller = load_controller(config.run)
     motion = load_motion(config.motion, controller.trained, config.seed)
+    console.print(f"motion: {motion.source}", markup=False)
     reference = motion.start_states(config.seed)
     figures = {
         "footfalls": footfalls(controller, motion, reference, config),

@@ -114,8 +114,11 @@ def load_motion(config: MotionConfig, trained: Mapping[str, Any], seed: int) -> 
     known = {name: Path(value) for name, value in trained.get("motion", {}).items() if isinstance(value, str)}
     if labelled is None and unlabelled is not None:
         raise ValueError("--motion.unlabelled needs --motion.labelled too: episodes start from labelled clips")
-    if labelled is None and "labelled" in known and known["labelled"].is_dir():
-        labelled, unlabelled = known["labelled"], known.get("unlabelled")
+    trained_on = known.get("labelled") if labelled is None else None
+    if trained_on is not None and not trained_on.is_dir():
+        print(f"{trained_on}, the labelled motion of the training, is gone: synthetic gaits take its place")
+    elif trained_on is not None:
+        labelled, unlabelled = trained_on, known.get("unlabelled")
         if unlabelled is not None and not unlabelled.exists():
             print(f"{unlabelled}, the unlabelled motion of the training, is gone: the prior is compared with nothing")
             unlabelled = None

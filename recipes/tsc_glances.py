@@ -17,6 +17,7 @@ Out: ``runs/NAME/`` with ``config.json``, ``policy/`` (kind ``student``), and th
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -130,10 +131,12 @@ def load_images(cfg: Config, device: torch.device) -> tuple[TensorDictBase, Tens
     return torch.cat(train), torch.cat(test)  # type: ignore[return-value, arg-type]
 
 
-def teach(glances: Glances, test: TensorDictBase, cfg: Config) -> dict[str, float]:
-    """Learn for the given time, print errors now and then; returns the last ones."""
+def teach(
+    glances: Glances, test: TensorDictBase, cfg: Config, interrupted: Callable[[], bool] = lambda: False
+) -> dict[str, float]:
+    """Learn for the given time, or until interrupted, print errors now and then; returns the last ones."""
     start, steps, reported = time.monotonic(), 0, 0
-    while (share := (time.monotonic() - start) / (60.0 * cfg.minutes)) < 1.0:
+    while (share := (time.monotonic() - start) / (60.0 * cfg.minutes)) < 1.0 and not interrupted():
         set_learning_rate(glances.optimizer, half_cosine(cfg.learning_rate, share, steps))
         found = glances.learn(ROUND, steps)
         steps += ROUND
@@ -166,10 +169,11 @@ def main(cfg: Config) -> Path:
     augmentation = make_augmentation(cfg.augmentation, seeds.generator("augmentation"))
     glances = Glances.of(student, course_of(trained.course), settings, augmentation, seeds.generator("batches"))
     folder = run_folder.start_run(cfg, cfg.runs / cfg.name, recipe="tsc_glances")
-    glances.images.extend(train)
-    print(f"{len(train)} images to learn from, {len(test)} held out")
-    show("before; held out", glances.measure(test))
-    teach(glances, test, cfg)
+    with run_folder.abandoned_by_errors(folder), cli.interruptible() as interrupted:
+        glances.images.extend(train)
+        print(f"{len(train)} images to learn from, {len(test)} held out")
+        show("before; held out", glances.measure(test))
+        teach(glances, test, cfg, interrupted)
     manifest = {name: value for name, value in trained.artifact.manifest.items() if name != "weights"}
     manifest["network"] = student.settings
     state = {name: value.detach().cpu().contiguous() for name, value in student.state_dict().items()}

@@ -25,7 +25,7 @@ from safetensors.torch import save_file
 from tensordict import TensorDictBase
 from tsc_artifacts import load_trained
 from tsc_student_config import CPU
-from tsc_student_setup import build, load_student, resolve, teachers_parts
+from tsc_student_setup import build, load_student, resolve
 
 from agility_rl.training import cli, run_folder
 
@@ -96,7 +96,7 @@ def collect(cfg: Config) -> TensorDictBase:
     if learner.artifact.manifest["teacher"] != trained.digest:
         print(f"{cfg.student} learned from another teacher than {cfg.teacher}, whose view of the terrain is stored")
     parts = build(run, trained)
-    load_student(parts, cfg.student, teachers_parts(run))
+    load_student(parts, cfg.student, kept=())
     parts.collector.led = round(cfg.led * cfg.num_robots)
     rows: list[TensorDictBase] = []
     start = time.monotonic()
@@ -114,11 +114,8 @@ def main(cfg: Config) -> Path:
     check(cfg)
     torch.set_num_threads(cfg.num_threads)
     folder = run_folder.start_run(cfg, cfg.runs / cfg.name, recipe="tsc_images")
-    try:
+    with run_folder.abandoned_by_errors(folder):
         images = collect(cfg)
-    except BaseException:  # there is nothing to go on with, and the name stays free
-        run_folder.abandon_run(folder)
-        raise
     save_file({name: value.contiguous() for name, value in images.items()}, folder / IMAGES_FILE)
     print(f"{images.numel()} images of {images.shape[1]} robots: {folder / IMAGES_FILE}")
     return folder

@@ -162,6 +162,8 @@ def check(cfg: Config) -> None:
 def begin(parts: Components, cfg: Config) -> None:
     """Start from another run's student, if one is given; an estimator of its own, unless that has one, learns first."""
     inherits = cfg.init_from is not None and load_student(parts, cfg.init_from, teachers_parts(cfg))
+    if parts.representation is not None:
+        parts.representation.begin()
     if cfg.estimator_history and not inherits:
         learn_to_estimate(parts, cfg)
 

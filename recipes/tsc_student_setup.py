@@ -49,6 +49,10 @@ class Representation:
     average: SoftUpdate
     optimizer: torch.optim.Optimizer
 
+    def begin(self) -> None:
+        """Let the target be the online network, whatever has been loaded into that."""
+        self.loss.target_network_params.data.copy_(self.loss.network_params.data)
+
 
 @dataclass
 class Components:

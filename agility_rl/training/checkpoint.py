@@ -73,6 +73,7 @@ class RunCheckpoint:
         self.directory = Path(directory)
         self._rotation = CheckpointRotation(self.directory, keep_last=keep_last, keep_best=keep_best, prefix=PREFIX)
         self._checkpoint = Checkpoint(format="archive")
+        self._modules: dict[str, torch.nn.Module] = {}
         for name, component in components.items():
             self.register(name, component)
 
@@ -84,6 +85,8 @@ class RunCheckpoint:
             KeyError: if the name is taken.
         """
         self._checkpoint.register(name, _saveable(name, component))
+        if isinstance(component, torch.nn.Module):
+            self._modules[name] = component
         return self
 
     def save(self, step: int, metadata: Mapping[str, Any] | None = None) -> Path:
@@ -97,7 +100,11 @@ class RunCheckpoint:
 
         Returns:
             The file, which is complete and on the disk when this returns.
+
+        Raises:
+            CheckpointError: if a weight is not finite: rotation would drop the last checkpoint that is of use.
         """
+        self._check_finite()
         staging = self.directory / _STAGING
         shutil.rmtree(staging, ignore_errors=True)  # what a killed save left
         staging.mkdir(parents=True)
@@ -151,6 +158,16 @@ class RunCheckpoint:
     def steps(self) -> tuple[int, ...]:
         """Steps of the checkpoints in the folder, damaged ones included, oldest first."""
         return tuple(step_of(path) for path in _files(self.directory))
+
+    def _check_finite(self) -> None:
+        for component, module in self._modules.items():
+            for name, weight in module.named_parameters():
+                if not bool(weight.isfinite().all()):
+                    kept = f"that of step {steps[-1]} stays" if (steps := self.steps()) else "there is no earlier one"
+                    raise CheckpointError(
+                        f"{self.directory}: {component}: {name} holds NaN or infinity, so no checkpoint was written, "
+                        f"and {kept}; the training diverged: go on from there with a lower learning rate"
+                    )
 
     def _path(self, step: int | None) -> Path:
         files = _files(self.directory)

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -72,6 +72,16 @@ def abandon_run(folder: str | Path) -> None:
     for empty in (*folder.iterdir(), folder):
         with contextlib.suppress(OSError):
             empty.rmdir()
+
+
+@contextlib.contextmanager
+def abandoned_by_errors(folder: str | Path) -> Iterator[None]:
+    """:func:`abandon_run` if what is done within fails: there is nothing to go on with, and the name stays free."""
+    try:
+        yield
+    except BaseException:
+        abandon_run(folder)
+        raise
 
 
 def read_config(folder: str | Path, kind: type[C]) -> C:

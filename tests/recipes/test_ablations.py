@@ -61,6 +61,23 @@ def test_every_variant_is_a_command_that_the_recipe_takes(
             assert list(cfg.changes) == kept and bool(kept) == (preset != "paper")
 
 
+def test_ctrl_c_waits_for_what_a_recipe_saves(
+    ablations: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "saves.py").write_text(
+        "import os, pathlib, signal, time\n"
+        "time.sleep(0.5)\n"
+        "os.kill(os.getppid(), signal.SIGINT)\n"
+        "time.sleep(1.0)\n"
+        "pathlib.Path(__file__).with_suffix('.saved').touch()\n"
+        "raise SystemExit(3)\n"
+    )
+    monkeypatch.setattr(ablations, "__file__", str(tmp_path / "ablations.py"))
+    with pytest.raises(ValueError, match=r"recipes/saves\.py ended with 3"):
+        ablations.command("saves")
+    assert (tmp_path / "saves.saved").is_file()
+
+
 def test_several_seeds_have_an_interval(ablations: ModuleType) -> None:
     row = dict.fromkeys(("walk", "pace", "trot", "canter", "jump", "nmi", "falls"), 0.5) | {"like_a_dog": 20}
     text = ablations.table({"none": [row | {"targets": 38}, row | {"targets": 40}]})

@@ -110,6 +110,9 @@ def test_motion_that_is_asked_for_must_be_there_and_motion_that_is_gone_is_named
     found = evaluate.load_motion(evaluate.MotionConfig(), trained, 0)
     assert len(found.labelled) == 2 and found.unlabelled == []
     assert "moved, the unlabelled motion of the training, is gone" in capsys.readouterr().out
+    found = evaluate.load_motion(evaluate.MotionConfig(), {"motion": {"labelled": str(tmp_path / "moved")}}, 0)
+    assert found.synthetic
+    assert "moved, the labelled motion of the training, is gone: synthetic gaits" in capsys.readouterr().out
 
 
 def test_gaits_of_robots_are_named_and_a_fall_is_no_gait(evaluate: ModuleType) -> None:

@@ -26,6 +26,7 @@ def test_all_figures_are_drawn_of_a_run_with_its_log(untrained: Path, recipe) ->
     logger.close()
     result = recipe("gait_figures", untrained, "--settle", 0.1, "--stay", 0.1, "--robots", 1)
     assert result.returncode == 0, result.stdout + result.stderr
+    assert "motion: synthetic gaits of agility_rl: no dog moved like this" in result.stdout
     pictures = {path.name: path.stat().st_size for path in (untrained / "figures").iterdir()}
     assert set(pictures) == {"footfalls.png", "transitions.png", "shift.png", "prior.png"}
     assert min(pictures.values()) > 5000

@@ -185,6 +185,24 @@ def test_a_flipped_bit_is_found(tmp_path: Path) -> None:
         RunCheckpoint(tmp_path, model=nn.Linear(64, 64)).load()
 
 
+def test_weights_that_are_not_finite_take_no_checkpoints_place(tmp_path: Path) -> None:
+    policy = nn.Linear(2, 1)
+    checkpoint = RunCheckpoint(tmp_path, keep_last=1, policy=policy, counters={"iteration": 1})
+    with torch.no_grad():
+        policy.bias.fill_(torch.inf)
+    with pytest.raises(CheckpointError, match=r"policy: bias holds NaN or infinity, .* and there is no earlier one"):
+        checkpoint.save(1)
+    assert checkpoint.steps() == ()
+    with torch.no_grad():
+        policy.bias.zero_()
+    checkpoint.save(2)
+    with torch.no_grad():
+        policy.weight[0, 1] = torch.nan
+    with pytest.raises(CheckpointError, match=r"policy: weight holds NaN .* that of step 2 stays"):
+        checkpoint.save(3)
+    assert checkpoint.steps() == (2,) and checkpoint.load() == 2 and bool(policy.weight.isfinite().all())
+
+
 def test_errors_say_what_to_do(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no checkpoint in"):
         RunCheckpoint(tmp_path / "none", counters={}).load()

@@ -15,6 +15,7 @@ import pytest
 import agility_rl
 from agility_rl.training.run_folder import (
     abandon_run,
+    abandoned_by_errors,
     from_json,
     read_config,
     read_json,
@@ -101,6 +102,17 @@ def test_a_run_that_cannot_begin_leaves_its_name_free(tmp_path: Path) -> None:
     (run / "notes.txt").write_text("mine")
     abandon_run(run)
     assert [path.name for path in run.iterdir()] == ["notes.txt"]
+
+
+def test_a_run_that_fails_leaves_its_name_free(tmp_path: Path) -> None:
+    run = tmp_path / "mine"
+    start_run(Config(), run)
+    with abandoned_by_errors(run):
+        pass
+    assert (run / "config.json").is_file()
+    with pytest.raises(KeyboardInterrupt), abandoned_by_errors(run):
+        raise KeyboardInterrupt
+    assert not run.exists()
 
 
 def test_json_round_trip_and_unknown_fields() -> None:
