@@ -85,6 +85,10 @@ class RobotLog:
                 object.__setattr__(self, group, value.float())
         object.__setattr__(self, "time", self.time.double())
         self._check_shapes()
+        if len(wrong := ((self.start != 0) & (self.start != 1)).nonzero()):
+            row = int(wrong[0])
+            raise RobotLogError(f"{self.name}: row {row}, start: expected 0 or 1, got {float(self.start[row]):g}")
+        object.__setattr__(self, "start", self.start.bool())
         self._check_finite()
         if len(self) < max(self.min_steps, 2):
             raise RobotLogError(f"{self.name} is too short: {len(self)} rows, expected at least {self.min_steps}")
@@ -118,13 +122,9 @@ class RobotLog:
             if group not in columns:
                 either = " (or quaternion)" if group == "roll_pitch" else ""
                 raise RobotLogError(f"{name} has no {group}{either}; it has {', '.join(sorted(columns)) or 'nothing'}")
-        start = columns.get("start", torch.zeros(len(columns["time"]))).reshape(-1)
-        if len(wrong := ((start != 0) & (start != 1)).nonzero()):
-            row = int(wrong[0])
-            raise RobotLogError(f"{name}: row {row}, start: expected 0 or 1, got {float(start[row]):g}")
         return cls(
             **{group: columns[group] for group in needed},
-            start=start.bool(),
+            start=columns.get("start", torch.zeros(len(columns["time"]))).reshape(-1),
             linear_acceleration=columns.get("linear_acceleration"),
             control_dt=control_dt,
             name=name,

@@ -138,6 +138,8 @@ class AgilityEnv(MaskedResets):
             raise ValueError(f"decision_steps must be at least 1, got {decision_steps}")
         course = full_course() if course is None else course
         pieces = scenery(course)
+        if simulator is not None and simulator_options:
+            raise ValueError(f"expected simulator or simulator_options, got both, with {sorted(simulator_options)}")
         simulator = simulator or make_simulator(num_simulations=num_robots, scenery=pieces, **(simulator_options or {}))
         super().__init__(device=simulator.device, batch_size=torch.Size([num_robots]))
         self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
@@ -263,7 +265,7 @@ class AgilityEnv(MaskedResets):
         return observation.to(self.device) if tensordict is None else observation
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        decision = tensordict[keys.ACTION]
+        decision = tensordict[keys.ACTION].detach()  # decisions are remembered, and must not keep a graph
         self.decisions.decide(decision[keys.BEHAVIOUR], decision[keys.PARAMETERS])
         outcome, leg = self._outcome(), self.arena.progress.leg
         for _ in range(self.decision_steps):

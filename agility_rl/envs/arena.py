@@ -54,7 +54,8 @@ class Arena:
         types: bool ``[K, 7]``, one-hot type of each obstacle.
 
     Raises:
-        ValueError: if ``start`` is something else, or ``start_spread`` or ``start_after`` out of its range.
+        ValueError: if ``start`` is something else, or ``start_spread`` or ``start_after`` out of its range,
+            or ``start_after`` given where nobody starts at random.
     """
 
     def __init__(
@@ -72,6 +73,8 @@ class Arena:
             raise ValueError(f"expected start 'random' or 'first', got {start!r}")
         if not 0.0 <= start_after <= 1.0:
             raise ValueError(f"start_after must be a share from 0 to 1, got {start_after}")
+        if start == "first" and start_after:
+            raise ValueError(f"start_after is a share of random starts, got {start_after} with start 'first'")
         if not 0.0 <= start_spread <= 10.0:
             raise ValueError(f"start_spread must be from 0 to 10, got {start_spread}")
         self.generator, self.random_start, self.start_spread = generator, start == "random", start_spread

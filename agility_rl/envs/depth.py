@@ -11,7 +11,6 @@ from torch import Tensor
 
 from agility_rl.envs.randomization import uniform
 from agility_rl.go2 import camera
-from agility_rl.go2.constants import CONTROL_DT
 from agility_rl.simulation import Simulator
 from agility_rl.tensors import rows_of
 
@@ -67,7 +66,7 @@ class DepthObservation:
         if min(pitch, offset_noise, pixel_noise) < 0.0:
             raise ValueError(f"pitch and noise must not be negative, got {pitch}, {offset_noise}, {pixel_noise}")
         n, device = simulator.num_simulations, simulator.device
-        self.generator, self.camera = generator, simulator.make_camera()
+        self.generator, self.camera, self.control_dt = generator, simulator.make_camera(), simulator.control_dt
         self.decision_steps, self.frame_steps, self.latency = decision_steps, frame_steps, latency
         self.pitch, self.offset_noise, self.pixel_noise = pitch, offset_noise, pixel_noise
         kept = math.ceil(latency[1] / max(decision_steps, frame_steps)) + 1
@@ -113,7 +112,7 @@ class DepthObservation:
     def age(self) -> Tensor:
         """How long ago that was taken, ``[N, 1]`` [s]; an episode's first frame, as if the robot had stood before."""
         taken = self._taken.gather(1, self._shown()[:, None])[:, 0].clamp(min=0)
-        return (CONTROL_DT * torch.maximum(self._step - taken, self._late))[:, None]
+        return (self.control_dt * torch.maximum(self._step - taken, self._late))[:, None]
 
     def _shown(self) -> Tensor:
         """Index of the frame that robots see, ``[N]``."""

@@ -107,6 +107,8 @@ class LocomotionEnv(MaskedResets):
     ) -> None:
         meeting = bool(encounters or boxes)
         engine = {"scenery": PIECES if meeting else (), **(simulator_options or {})}
+        if simulator is not None and simulator_options:
+            raise ValueError(f"expected simulator or simulator_options, got both, with {sorted(simulator_options)}")
         simulator = simulator or make_simulator(num_simulations=num_robots, **engine)
         super().__init__(device=simulator.device, batch_size=torch.Size([num_robots]))
         self.is_closed = False  # EnvBase starts as closed, and close() would leave the simulator's threads running
@@ -189,8 +191,15 @@ class LocomotionEnv(MaskedResets):
             skill: int64 ``[N]``.
             command: ``[N, 5]`` in the order and units of :data:`agility_rl.behaviours.COMMANDS`.
             shift: ``[N, 1]`` in [-1, 1], zero if not given.
+
+        Raises:
+            ValueError: if one of them has another shape.
         """
         shift = torch.zeros(self.num_robots, 1, device=self.device) if shift is None else shift
+        expected = [list(now.shape) for now in (self.commands.skill, self.commands.command, self.commands.shift)]
+        found = [list(given.shape) for given in (skill, command, shift)]
+        if found != expected:
+            raise ValueError(f"expected skill, command and shift of {expected}, got {found}")
         self.commands.assign(self._everyone(), *(given.to(self.device) for given in (skill, command, shift)))
 
     def set_skill_probabilities(self, probabilities: Tensor) -> None:
@@ -238,7 +247,7 @@ class LocomotionEnv(MaskedResets):
         return observation.to(self.device) if tensordict is None else observation
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict[keys.ACTION]
+        action = tensordict[keys.ACTION].detach()  # the engine has no gradients, and states must not keep a graph
         self.pushes.apply(self.simulator, self._step_count)
         self.robots.step(action)
         self._step_count = self._step_count + 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from typing import Any
+from weakref import WeakSet
 
 import mujoco
 import torch
@@ -117,6 +118,7 @@ class WarpSimulator:
         self._ctrl.copy_(self._previous_target)
         self.unstable = torch.zeros(num_simulations, dtype=torch.bool, device=self.device)
         self._seen, self._steps, self._told = torch.zeros_like(self._flags), 0, False
+        self._cameras: WeakSet[WarpDepthCamera] = WeakSet()
         self._graph = self._capture()
         with on_device(self.device):
             mjw.forward(self._model, data)
@@ -301,7 +303,9 @@ class WarpSimulator:
 
     def make_camera(self) -> WarpDepthCamera:
         """A depth camera on every robot, which follows these simulations."""
-        return WarpDepthCamera(self.world.spec, self._data, self.device)
+        eye = WarpDepthCamera(self.world.spec, self._data, self.device)
+        self._cameras.add(eye)
+        return eye
 
     def _state(self) -> dict[str, Tensor]:
         return {
@@ -348,6 +352,8 @@ class WarpSimulator:
         self._read()
 
     def close(self) -> None:
-        """Release memory; the simulator cannot be used afterwards."""
+        """Release memory, the cameras' too; neither simulator nor cameras can be used afterwards."""
+        for eye in self._cameras:
+            eye.close()
         for name in ("_graph", "_data", "_model", "_parameters", *_VIEWS):
             self.__dict__.pop(name, None)

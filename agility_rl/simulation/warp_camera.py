@@ -87,3 +87,8 @@ class WarpDepthCamera:
             mjw.render(self._model, self._data, self._context)
         depth = self._image[rows_of(mask)].unflatten(-1, (camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH))
         return torch.where(depth <= 0.0, math.inf, depth)
+
+    def close(self) -> None:
+        """Release memory; the camera cannot be used afterwards."""
+        for name in ("_image", "_quaternion", "_source", "_context", "_data", "_model"):
+            self.__dict__.pop(name, None)

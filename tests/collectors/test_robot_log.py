@@ -60,6 +60,15 @@ def test_transitions_by_hand() -> None:
     assert set(td.keys(True, True)) == {"measurement", "action", ("next", "measurement")}
 
 
+def test_starts_of_any_type_are_starts() -> None:
+    groups = columns()
+    for dtype in (torch.int64, torch.float32, torch.bool):
+        log = RobotLog(**groups | {"start": (torch.arange(150) == 40).to(dtype)})
+        assert log.start.dtype == torch.bool and len(log.transitions()) == 148
+    with pytest.raises(RobotLogError, match="row 3, start: expected 0 or 1, got 2"):
+        RobotLog(**groups | {"start": 2 * (torch.arange(150) == 3)})
+
+
 def test_numbers_of_numpy_become_those_of_networks() -> None:
     groups = {name: value.double() for name, value in columns().items()}
     log = RobotLog.from_columns(groups)

@@ -20,7 +20,8 @@ def build() -> Iterator[Callable[..., LocomotionEnv]]:
     made: list[LocomotionEnv] = []
 
     def make(num_robots: int = 4, **options: Any) -> LocomotionEnv:
-        options.setdefault("simulator_options", {"num_threads": 1})
+        if "simulator" not in options:
+            options.setdefault("simulator_options", {"num_threads": 1})
         made.append(LocomotionEnv(num_robots, **options))
         return made[-1]
 

@@ -40,7 +40,8 @@ def build() -> Iterator[Build]:
     made: list[AgilityEnv] = []
 
     def make(num_robots: int = 4, controller: Any = sway, **options: Any) -> AgilityEnv:
-        options.setdefault("simulator_options", {"num_threads": 1})
+        if "simulator" not in options:
+            options.setdefault("simulator_options", {"num_threads": 1})
         made.append(AgilityEnv(num_robots, controller, **options))
         return made[-1]
 
@@ -331,9 +332,22 @@ def test_pushes_set_the_trunk_velocity(build: Build) -> None:
         assert jump[due].mean() > max(0.1, 4 * jump[~due].mean())
 
 
+def test_decisions_with_gradients_keep_no_graph(build: Build) -> None:
+    env = build(2)
+    carrier = env.reset()
+    for _ in range(3):
+        decision = env.action_spec.rand()
+        decision[keys.ACTION, keys.PARAMETERS].requires_grad_()
+        carrier = env.step(carrier.update(decision))["next"]
+    assert not any(value.requires_grad for value in carrier.values(True, True))
+    assert not env.decisions.parameters.requires_grad
+
+
 def test_wrong_arguments_are_refused(build: Build) -> None:
     with pytest.raises(ValueError, match="holds 2 robots, expected 3"):
         build(3, simulator=make_simulator(num_simulations=2, num_threads=1))
+    with pytest.raises(ValueError, match=r"simulator or simulator_options, got both, with \['sim_dt'\]"):
+        build(2, simulator=make_simulator(num_simulations=2), simulator_options={"sim_dt": 0.01})
     with pytest.raises(ValueError, match="must hold scenery\\(course\\) of 'full'"):
         build(2, simulator=make_simulator(num_simulations=2, num_threads=1))
     with pytest.raises(ValueError, match="decision_steps"):

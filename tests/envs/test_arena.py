@@ -93,6 +93,8 @@ def test_a_start_where_the_obstacle_before_is_left() -> None:
     assert 0.3 < (turn[back] > 2.5).float().mean() < 0.7
     with pytest.raises(ValueError, match=r"start_after must be a share from 0 to 1, got 1\.5"):
         build(start_after=1.5)
+    with pytest.raises(ValueError, match=r"a share of random starts, got 0\.5 with start 'first'"):
+        build(start="first", start_after=0.5)
 
 
 def test_curriculum() -> None:

@@ -194,13 +194,31 @@ def test_threads_and_seeds_reproduce_the_images(build: Callable[..., AgilityEnv]
 
 
 def test_a_camera_changes_nothing_else(build: Callable[..., AgilityEnv]) -> None:
-    silent = {**STILL, "latency": (1, 1)}
-    with_camera, without = build(depth=silent), build(depth=None)
+    """It draws its delays from the environment's generator: nothing else is drawn in these steps."""
+    options = {"command_noise": (1.0, 1.0), "episode_length": 10.0}
+    with_camera, without = build(depth={**STILL, "latency": (1, 1)}, **options), build(depth=None, **options)
+    positions = []
     for env in (with_camera, without):
         env.generator.manual_seed(5)
-        env.reset()
-    position = with_camera.simulator.root_position
-    assert torch.equal(position, without.simulator.root_position)
+        carrier = env.reset()
+        began = env.simulator.root_position.clone()
+        for _ in range(5):
+            carrier = env.step(carrier.update(without.action_spec.zero()))["next"]
+        positions.append(env.simulator.root_position.clone())
+        assert not torch.equal(began, positions[-1])
+    assert torch.equal(*positions)
+
+
+def test_images_are_as_old_as_control_steps_are_long(build: Callable[..., AgilityEnv]) -> None:
+    ages = []
+    for control_dt in (0.02, 0.01):
+        env = build(depth={**STILL, "latency": (2, 2)}, simulator_options={"num_threads": 1, "control_dt": control_dt})
+        carrier = env.reset()
+        for _ in range(4):
+            carrier = env.step(carrier.update(env.action_spec.zero()))["next"]
+        ages.append(carrier[keys.IMAGE_AGE])
+    torch.testing.assert_close(ages[0], 2.0 * ages[1])
+    assert (ages[1] >= 0.02).all()
 
 
 def test_resume_is_bit_exact(build: Callable[..., AgilityEnv]) -> None:

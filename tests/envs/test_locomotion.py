@@ -338,6 +338,24 @@ def test_close_releases_the_engine(build: Build) -> None:
         env.close()
 
 
+def test_actions_with_gradients_are_taken(build: Build) -> None:
+    env = build(2)
+    action = torch.zeros(2, 12, requires_grad=True)
+    found = env.step(env.reset().set(keys.ACTION, 2.0 * action))["next"]
+    assert not any(value.requires_grad for value in found.values(True, True))
+
+
+def test_commands_of_another_shape_are_refused(build: Build) -> None:
+    env = build(3)
+    skill, command = torch.zeros(3, dtype=torch.int64), torch.zeros(3, 5)
+    message = r"expected skill, command and shift of \[\[3\], \[3, 5\], \[3, 1\]\], got \[\[3\], \[3, 5\], \[3\]\]"
+    with pytest.raises(ValueError, match=message):
+        env.set_commands(skill, command, torch.zeros(3))
+    assert env.commands.vector().shape == (3, 11)
+
+
 def test_a_simulator_of_another_size_is_refused(build: Build) -> None:
+    with pytest.raises(ValueError, match=r"simulator or simulator_options, got both, with \['sim_dt'\]"):
+        build(2, simulator=make_simulator(num_simulations=2), simulator_options={"sim_dt": 0.01})
     with pytest.raises(ValueError, match="holds 2 robots, expected 3"):
         build(3, simulator=make_simulator(num_simulations=2, num_threads=1))

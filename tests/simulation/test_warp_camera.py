@@ -42,6 +42,7 @@ def test_images_are_those_of_the_cpu_camera(generator: torch.Generator) -> None:
         images.append(eye.render(everyone(robots)))
         assert torch.equal(eye.render(only(robots, 1, 4)), images[-1][[1, 4]])
         simulator.close()
+        assert not {"_source", "_data", "_context"} & set(vars(eye)), "a camera would hold the simulations"
     ours, theirs = (image.clamp(max=NETWORK_RANGE) for image in images)
     assert ours.shape == (robots, camera.IMAGE_HEIGHT, camera.IMAGE_WIDTH)
     assert (theirs < NETWORK_RANGE).flatten(1).float().mean(-1).min() > 0.2, "every robot must see something"
