@@ -263,6 +263,8 @@ CPU = Config(
     adaptation=AdaptationConfig(learning_rate=1e-3, minibatches=4),
     curriculum=CurriculumConfig(difficulty=1.0, obstacles=6, practice=2.0),
 )
+GPU = replace(CPU, simulator="warp", iterations=1321, max_minutes=None, env=replace(CPU.env, num_robots=4096))
+"""``cpu`` with more robots; as many iterations as that has made teachers with (docs/gpu.md; not tried to its end)."""
 SMOKE = replace(
     CPU,
     name="smoke_teacher",
@@ -274,4 +276,4 @@ SMOKE = replace(
     cloning=replace(CPU.cloning, iterations=1, epochs=1, minibatches=2),
     curriculum=replace(CPU.curriculum, episodes=1),
 )
-PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}
+PRESETS = {"smoke": SMOKE, "cpu": CPU, "gpu": GPU, "paper": PAPER}

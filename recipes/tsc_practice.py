@@ -10,7 +10,7 @@ Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap``, ``checkpoints/``, ``
     python recipes/tsc_practice.py cpu --student runs/my_student --name practised
     python recipes/tsc_practice.py cpu --resume runs/practised            # goes on exactly where it stopped
 
-Presets: ``smoke`` (seconds), ``cpu`` (two cores). Ctrl-C ends the iteration and saves.
+Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``gpu``. Ctrl-C ends the iteration and saves.
 """
 
 from __future__ import annotations
@@ -105,6 +105,8 @@ class Config(HardwareConfig):
 
 
 CPU = Config()
+GPU = replace(CPU, simulator="warp", max_minutes=None, env=replace(CPU.env, num_robots=1024))
+"""``cpu`` with more robots (docs/gpu.md; not tried to its end)."""
 SMOKE = replace(
     CPU,
     name="smoke_practice",
@@ -114,7 +116,7 @@ SMOKE = replace(
     env=replace(CPU.env, num_robots=4),
     ppo=replace(CPU.ppo, steps=4, epochs=1, minibatches=2, hidden=(32, 32), critic_warm_up=1),
 )
-PRESETS = {"smoke": SMOKE, "cpu": CPU}
+PRESETS = {"smoke": SMOKE, "cpu": CPU, "gpu": GPU}
 
 
 @dataclass

@@ -12,7 +12,7 @@ Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap``, ``checkpoints/``, ``
     python recipes/tsc_student.py cpu --teacher runs/my_teacher --glance.images 20000 --glance.steps 16
     python recipes/tsc_student.py cpu --resume runs/my_student            # goes on exactly where it stopped
 
-Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper``. Ctrl-C ends the iteration and saves.
+Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``gpu``, ``paper``. Ctrl-C ends the iteration and saves.
 """
 
 from __future__ import annotations

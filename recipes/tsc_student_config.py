@@ -266,6 +266,8 @@ CPU = Config(
     ),
     curriculum=CurriculumConfig(difficulty=1.0, obstacles=6, practice=1.0),
 )
+GPU = replace(CPU, simulator="warp", max_minutes=None, env=replace(CPU.env, num_robots=1024))
+"""``cpu`` with more robots (docs/gpu.md; not tried to its end)."""
 SMOKE = replace(
     CPU,
     name="smoke_student",
@@ -283,4 +285,4 @@ SMOKE = replace(
     glance=GlanceConfig(images=8, every=1, epochs=1, batch=4, held_out=0.25, kept=16),
     estimation=EstimationConfig(robots=2, decisions=4, epochs=1, batch=4),
 )
-PRESETS = {"smoke": SMOKE, "cpu": CPU, "paper": PAPER}
+PRESETS = {"smoke": SMOKE, "cpu": CPU, "gpu": GPU, "paper": PAPER}

@@ -9,7 +9,7 @@ Out: ``runs/NAME/`` with ``config.json``, ``metrics.mcap``, ``checkpoints/``, ``
     python recipes/tsc_teacher.py cpu --resume runs/my_teacher            # goes on exactly where it stopped
     python recipes/tsc_teacher.py cpu --init-from runs/my_teacher --env.course box
 
-Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``paper``.
+Presets: ``smoke`` (seconds), ``cpu`` (two cores), ``gpu``, ``paper``.
 """
 
 from __future__ import annotations

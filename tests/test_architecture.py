@@ -85,7 +85,13 @@ PUBLIC: dict[str, tuple[str, ...]] = {
 """Names that users import. Taking one away breaks their code: do it on purpose, here and in the changelog."""
 
 RANDOM_FUNCTIONS = {"rand", "randn", "randint", "randperm", "multinomial", "bernoulli", "normal"}
+RANDOM_FUNCTIONS |= {"rand_like", "randn_like", "randint_like"}  # which take no generator
+OTHER_DRAWS = {"rand", "randn", "random", "randint", "uniform", "normal", "gauss", "choice", "choices", "sample"}
+OTHER_DRAWS |= {"shuffle", "permutation", "standard_normal"}
+"""Draws by the modules ``random`` and ``numpy.random`` themselves, whose generators are everybody's."""
 RANDOM_METHODS = {
+    "multinomial",
+    "bernoulli",
     "uniform_",
     "normal_",
     "bernoulli_",
@@ -184,15 +190,19 @@ def unsafe_loads(syntax: ast.Module) -> list[str]:
 
 
 def unseeded_draws(syntax: ast.Module) -> list[str]:
-    """Draws from torch's global generator."""
+    """Draws from a global generator, of torch, NumPy or Python."""
     found = []
     for node in ast.walk(syntax):
         if isinstance(node, ast.Call):
             origin, _, function = name_of(node.func).rpartition(".")
-            draws = (origin == "torch" and function in RANDOM_FUNCTIONS) or (
-                isinstance(node.func, ast.Attribute)
-                and node.func.attr in RANDOM_METHODS
-                and not origin.endswith("init")
+            draws = (
+                (origin == "torch" and function in RANDOM_FUNCTIONS)
+                or (origin in {"random", "np.random", "numpy.random"} and function in OTHER_DRAWS)
+                or (
+                    isinstance(node.func, ast.Attribute)
+                    and node.func.attr in RANDOM_METHODS
+                    and not origin.endswith("init")
+                )
             )
             if draws and not any(keyword.arg == "generator" for keyword in node.keywords):
                 found.append(f"line {node.lineno} draws by {function or ast.unparse(node.func)} without generator=")
@@ -301,6 +311,12 @@ def test_no_random_number_comes_from_the_global_generator(file: Path) -> None:
         ("x.normal_(generator=g)", True),
         ("torch.nn.init.uniform_(weight, -1, 1)", True),
         ("torch.zeros(3)", True),
+        ("torch.randn_like(x)", False),
+        ("p.multinomial(1)", False),
+        ("p.multinomial(1, generator=g)", True),
+        ("np.random.rand()", False),
+        ("random.choice(rows)", False),
+        ("np.random.default_rng(0)", True),
     ],
 )
 def test_the_rule_on_random_numbers_itself(source: str, seeded: bool) -> None:

@@ -109,7 +109,7 @@ class Artifact:
         folder.mkdir(parents=True, exist_ok=True)
         _write(folder / complete["weights"]["file"], weights)
         _write(folder / MANIFEST_FILE, (json.dumps(complete, indent=2) + "\n").encode())
-        for old in folder.glob("weights-*.safetensors"):
+        for old in (*folder.glob("weights-*.safetensors"), *folder.glob(".weights-*.incoming")):  # of a killed save
             if old.name != complete["weights"]["file"]:
                 old.unlink(missing_ok=True)
         return cls(tensors, complete, folder)

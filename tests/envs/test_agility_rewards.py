@@ -34,6 +34,8 @@ def test_goal_velocity_counts_up_to_the_target(on_course: Make) -> None:
     velocity = torch.tensor([[0.2, 5.0], [1.2, 1.6], [-0.4, 0.0]])
     state = on_course(3, goal_direction=direction, velocity=velocity, target_speed=torch.tensor([0.4, 2.5, 0.4]))
     torch.testing.assert_close(rewards.goal_velocity(state), torch.tensor([0.5, 0.8, -1.0]), atol=1e-4, rtol=0)
+    paid = rewards.goal_velocity(state, least=1.2)
+    torch.testing.assert_close(paid, torch.tensor([0.2 / 1.2, 0.8, -0.4 / 1.2]), atol=1e-4, rtol=0)
     fast = on_course(1, goal_direction=direction[:1], velocity=torch.tensor([[3.0, 0.0]]))
     assert rewards.goal_velocity(fast).item() == pytest.approx(1.0, abs=1e-4)
 

@@ -80,6 +80,23 @@ def test_unlabelled_weights_count(clips: dict[str, MotionClip], generator: torch
     assert (tags == 5).float().mean() == pytest.approx(2 / 102, abs=0.005)
 
 
+@pytest.mark.parametrize(("weight", "share"), [(1.0, 0.5), (0.1, 0.1 / 1.1), (0.0, 0.0)])
+def test_motion_of_dogs_that_stand_counts_less(
+    make_clip: ClipMaker, generator: torch.Generator, weight: float, share: float
+) -> None:
+    """Half a minute of standing and as much of walking, in clips of their own."""
+    velocity = torch.tensor([1.0, 0.0, 0.0])
+    stands, walks = (tagged(make_clip(frames=1501), number) for number in (1.0, 2.0))
+    stands = replace(stands, root_linear_velocity=torch.zeros_like(stands.root_linear_velocity))
+    walks = replace(walks, root_linear_velocity=velocity.expand_as(walks.root_linear_velocity))
+    dataset = MotionDataset([], [stands, walks], features=tag_and_frame, standing_weight=weight)
+    drawn = dataset.sample_unlabelled(4000, generator)["motion"][:, 0, 0]
+    assert (drawn == 1.0).float().mean().item() == pytest.approx(share, abs=0.03)
+    assert dataset.as_recorded == (weight == 1.0)
+    whole = dataset.sample_unlabelled(4000, generator, as_recorded=True)["motion"][:, 0, 0]
+    assert (whole == 1.0).float().mean().item() == pytest.approx(0.5, abs=0.03)
+
+
 def test_classes_are_drawn_by_share_and_clips_by_weight(dataset: MotionDataset, generator: torch.Generator) -> None:
     shares = torch.tensor([0.8, 0.0, 0.2, 0.0, 0.0])
     batch = dataset.sample_labelled(20000, generator, shares)

@@ -8,8 +8,10 @@ from types import ModuleType
 
 import torch
 
+from agility_rl import rotations
 from agility_rl.behaviours import JUMP, NUM_BEHAVIOURS
 from agility_rl.envs import LocomotionEnv
+from agility_rl.go2 import features
 from agility_rl.modules import BasicBehaviourController
 from agility_rl.motion import synthesize_gait
 
@@ -29,6 +31,26 @@ def test_demonstration_is_what_the_environment_would_show(module: Callable[[str]
     torch.testing.assert_close(command[:1], torch.tensor([1.0]), rtol=0.0, atol=0.1)
     assert command[3] == 0.0 and 0.2 < command[4] < 0.4
     assert command[-NUM_BEHAVIOURS:].argmax() == 2 and (shown["peak"] == 0.0).all()
+
+
+def test_what_is_shown_is_in_the_robots_frame_and_the_last_action_is_the_last(
+    module: Callable[[str], ModuleType],
+) -> None:
+    clip = replace(synthesize_gait("trot", speed=1.0, yaw_rate=0.5), label="trot")
+    shown = module("bbc_cloning").demonstration(clip, PRIVILEGED, torch.Generator().manual_seed(0))
+    to_trunk = rotations.rotate_inverse
+    columns, place = {}, 0
+    for entry in features.PROPRIOCEPTION_LAYOUT:
+        columns[entry.name] = shown["proprioception"][:, place : place + entry.size] / entry.scale
+        place += entry.size
+    roll, pitch, _ = rotations.to_euler(clip.root_quaternion)
+    torch.testing.assert_close(columns["roll_pitch"], torch.stack((roll, pitch), -1))
+    turning = to_trunk(clip.root_quaternion, clip.root_angular_velocity)
+    torch.testing.assert_close(columns["angular_velocity"], turning)
+    torch.testing.assert_close(columns["last_action"][1:], shown["action"][:-1])
+    velocity = to_trunk(clip.root_quaternion, clip.root_linear_velocity)
+    torch.testing.assert_close(shown["explicit"], features.explicit(clip.root_position[:, 2:], velocity))
+    assert (velocity[:, :2] - clip.root_linear_velocity[:, :2]).abs().max() > 0.1, "it turns"
 
 
 def test_a_jump_commands_its_own_peak(module: Callable[[str], ModuleType]) -> None:

@@ -11,6 +11,8 @@ import pytest
 import torch
 
 from agility_rl.behaviours import BEHAVIOURS
+from agility_rl.envs.rewards import jump_height_peak, jump_height_window
+from agility_rl.envs.terminations import thigh_contact
 from agility_rl.motion import synthesize_gait
 from agility_rl.training.seeding import Seeds
 
@@ -27,6 +29,20 @@ def test_only_rewards_with_a_weight_are_paid(module: Module) -> None:
     ours, names = world.rewards(replace(published, **weights)), ("turn", "velocity", "lateral")
     assert [ours[f"{name}_progress"].weight for name in names] == [3.0, 2.0, 4.0]
     assert ours["jump_height"].weight == 5.0
+    narrow = world.rewards(replace(published, collision_weight=-2.0, jump_reward="peak", jump_width=0.03))
+    assert narrow["collision"].weight == -2.0
+    assert narrow["jump_height"].function.func is jump_height_peak
+    assert narrow["jump_height"].function.keywords == {"width": 0.03}
+    assert world.rewards(replace(published, jump_reward="window"))["jump_height"].function is jump_height_window
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_who_sits_ends_an_episode_where_told(module: Module, ends: bool) -> None:
+    world, smoke = module("bbc_world"), module("bbc_presets").SMOKE
+    options = replace(smoke.env, num_robots=4, num_threads=1, rhythm_weight=0.0, end_when_sitting=ends)
+    env = world.make_env(replace(smoke, env=options), world.load_dataset(smoke.motion, 0), Seeds(0))
+    assert (thigh_contact in env.terminations) is ends
+    env.close()
 
 
 def test_shares_and_delay_hold_from_the_first_episode_on(module: Module) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -74,12 +75,20 @@ def test_every_robot_is_told_its_shift_and_the_fallen_do_not_count(
         return env
 
     monkeypatch.setattr(figures, "make_env", watched)
+    measure, fell = figures.drive, torch.zeros(90, dtype=torch.bool)
+    fell[[0, 7]] = True  # whoever else falls
+
+    def driven(*arguments):
+        recording = measure(*arguments)
+        return replace(recording, fell=fell)
+
+    monkeypatch.setattr(figures, "drive", driven)
     config = figures.Config(untrained, settle=0.1, robots=2)
     effect = figures.shift_effect(controller, motion.start_states(0), config)
     assert effect.shape == (5, 9, 2, 4)
     skill, _, shift = told[-1]
     assert torch.equal(skill.unflatten(0, (5, 9, 2))[:, 0, 0], torch.arange(5))
     torch.testing.assert_close(shift.unflatten(0, (5, 9, 2))[2, :, 1, 0], torch.linspace(-1.0, 1.0, 9))
-    fallen = effect.isnan()
-    assert (fallen.any(-1) == fallen.all(-1)).all()
+    assert torch.equal(effect.isnan().all(-1).flatten(), fell)
+    assert torch.equal(effect[..., 1:3].isnan().any(-1).flatten(), fell), "speed and height of all others are numbers"
     assert figures.shifts(effect).axes[1].get_title() == "speed [m/s]"

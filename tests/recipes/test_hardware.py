@@ -85,6 +85,20 @@ def test_contacts_have_the_room_that_is_asked_for(module: Module) -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="here is a GPU")
+@pytest.mark.parametrize("name", RECIPES)
+def test_the_preset_gpu_is_the_preset_cpu_with_more_robots_on_a_gpu(module: Module, name: str) -> None:
+    cpu, gpu = (module(name).PRESETS[preset] for preset in ("cpu", "gpu"))
+    assert gpu.simulator == "warp" and gpu.device == "cuda" and gpu.env.num_robots > 2 * cpu.env.num_robots
+    same = replace(
+        gpu,
+        simulator=cpu.simulator,
+        max_minutes=cpu.max_minutes,
+        iterations=cpu.iterations,
+        env=replace(gpu.env, num_robots=cpu.env.num_robots),
+    )
+    assert same == cpu
+
+
 def test_a_missing_gpu_ends_a_run_before_it_begins(module: Module, options: Callable[[str], Any]) -> None:
     cfg = replace(options("bbc_pretrain"), simulator="warp")
     with pytest.raises(HardwareError, match=r"cannot run on cuda: .*, or take the simulator 'batch'"):

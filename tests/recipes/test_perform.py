@@ -24,6 +24,11 @@ def test_it_records_an_episode_and_never_overwrites_one(untrained: Path, recipe,
     assert episode["command/jump_height"][-1] == pytest.approx(0.5)
     assert read_metadata(path)["pieces"] == [["trot", 0, 20], ["jump", 20, 20]]
     assert (untrained / "episodes" / "agility_rl.layout.json").is_file()
+    drawn = recipe("picture_strip", path, untrained / "strip.png", "--frames", 3, MUJOCO_GL="egl")
+    if drawn.returncode:  # for want of graphics, and of nothing else
+        assert "gl" in drawn.stderr.lower(), drawn.stderr
+    else:
+        assert (untrained / "strip.png").stat().st_size > 20_000
     perform = module("perform")
     again = perform.Config(untrained, behaviours=("trot",), seconds=0.1, strip=False)
     assert perform.main(again, Console()).name == "perform_1.mcap"

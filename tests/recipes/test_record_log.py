@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from tensordict import TensorDict
 from agility_rl.behaviours import BEHAVIOURS
 from agility_rl.collectors import RobotLog
 from agility_rl.go2 import constants
+from agility_rl.simulation import Simulator
 
 Module = Callable[[str], ModuleType]
 
@@ -39,6 +41,26 @@ def test_a_log_and_its_truth(record: ModuleType, tmp_path: Path, capsys: pytest.
     assert found["recording"]["latency"] == 1 and found["recording"]["policy"] == "open-loop trot"
     assert "200 rows, 4 s" in capsys.readouterr().out
     assert sorted(file.name for file in tmp_path.iterdir()) == ["target.csv", "target.truth.json"]
+
+
+def test_the_log_is_of_the_robot_that_the_truth_names(
+    record: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: dict[str, Any] = {}
+    log = record.record_robot_log
+
+    def watched(simulator: Simulator, *arguments: Any, **options: Any) -> RobotLog:
+        seen.update(options, friction_loss=simulator.parameter("friction_loss")[0].tolist())
+        seen["stiffness"] = simulator.parameter("stiffness")[0].tolist()
+        return log(simulator, *arguments, **options)
+
+    monkeypatch.setattr(record, "record_robot_log", watched)
+    truth = record.Truth(hip_stiffness=1.3)
+    cfg = replace(record.PRESETS["smoke"], log=tmp_path / "target.csv", truth=truth, noise=0.5, latency=2)
+    record.main(replace(cfg, friction_loss=0.1))
+    assert (seen["noise"], seen["latency"]) == (0.5, 2)
+    assert seen["stiffness"] == pytest.approx([52.0, 40.0, 40.0] * 4)
+    assert seen["friction_loss"] == pytest.approx([0.1] * 12)
 
 
 def test_a_seed_makes_the_draw_and_a_given_value_changes_no_other(record: ModuleType) -> None:
