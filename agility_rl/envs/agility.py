@@ -93,8 +93,9 @@ class AgilityEnv(MaskedResets):
         seed: seed of all randomness in the environment.
 
     Raises:
-        ValueError: if the simulator holds another number of robots or other scenery, a number is impossible, or there
-            is no reward term or no termination.
+        ValueError: if the simulator holds another number of robots or other scenery, or comes with
+            ``simulator_options``, a number is impossible, or there is no reward term or no termination.
+        TypeError: if ``course`` is none, such as the name of one.
 
     Example:
         >>> def stand(td):

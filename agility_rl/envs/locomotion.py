@@ -70,10 +70,10 @@ class LocomotionEnv(MaskedResets):
         seed: seed of all randomness in the environment.
 
     Raises:
-        ValueError: if the simulator holds another number of robots or, with encounters, another world, a reference
-            entry is missing or too short, a behaviour has no reference state, ``standing_starts`` is no share, the
-            offsets do not rise from zero, commands or pushes shall come more often than at every control step, or there
-            is no reward term or no termination.
+        ValueError: if the simulator holds another number of robots or, with encounters, another world, or comes with
+            ``simulator_options``, a reference entry is missing or too short, a behaviour has no reference state,
+            ``standing_starts`` is no share, the offsets do not rise from zero, commands or pushes shall come more often
+            than at every control step, or there is no reward term or no termination.
 
     Example:
         >>> env = LocomotionEnv(2, simulator_options={"num_threads": 1})

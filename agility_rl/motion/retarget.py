@@ -75,8 +75,8 @@ def retarget(
     """Retarget a dog recording to the Go2, at the recording's frame rate.
 
     The trunk follows the middle of hips and shoulders over the dog's floor, scaled and lifted; the floor is where the
-    toes of the stretch stand, at whatever height. Each foot follows the scaled toe, shifted by
-    a constant in the heading frame that puts its mean place under its hip,
+    toes of the stretch stand, at whatever height. Each foot follows the scaled toe, shifted by a constant in the
+    heading frame that puts its mean place under its hip,
 
     .. math:: p_i(t) = s\\, toe_i(t) + R_{yaw}(t) \\left(n_i - \\overline{s R_{yaw}^{-1} (toe_i - trunk)}\\right)
 
